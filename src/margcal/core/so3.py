@@ -26,7 +26,7 @@ def skew(v: ArrayLike) -> Array:
     return out
 
 
-def _sinc_terms(angle: Array) -> tuple[Array, Array, Array]:
+def sinc_terms(angle: Array) -> tuple[Array, Array, Array]:
     """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3, exact through a = 0."""
     small = angle < _SMALL
     a = np.where(small, 1.0, angle)
@@ -41,7 +41,7 @@ def _sinc_terms(angle: Array) -> tuple[Array, Array, Array]:
 def exp(v: ArrayLike) -> Array:
     """Rotation matrix of rotation vector `v` (Rodrigues)."""
     v = np.asarray(v, dtype=np.float64)
-    s, c, _ = _sinc_terms(np.linalg.norm(v, axis=-1))
+    s, c, _ = sinc_terms(np.linalg.norm(v, axis=-1))
     k = skew(v)
     return np.eye(3) + s[..., None, None] * k + c[..., None, None] * (k @ k)
 
@@ -54,7 +54,7 @@ def log(R: ArrayLike) -> Array:
 def left_jacobian(v: ArrayLike) -> Array:
     """J_l with ``exp(v + d) ~ exp(J_l(v) d) exp(v)``."""
     v = np.asarray(v, dtype=np.float64)
-    _, c, d = _sinc_terms(np.linalg.norm(v, axis=-1))
+    _, c, d = sinc_terms(np.linalg.norm(v, axis=-1))
     k = skew(v)
     return np.eye(3) + c[..., None, None] * k + d[..., None, None] * (k @ k)
 
@@ -85,7 +85,7 @@ def quat_exp(v: ArrayLike) -> Array:
     """Unit quaternion of rotation vector `v`."""
     v = np.asarray(v, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1, keepdims=True)
-    half_sinc = 0.5 * _sinc_terms(angle / 2)[0]
+    half_sinc = 0.5 * sinc_terms(angle / 2)[0]
     return np.concatenate([np.cos(angle / 2), half_sinc * v], axis=-1)
 
 

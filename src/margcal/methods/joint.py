@@ -1,0 +1,513 @@
+"""All sensors and all attitudes of a node in one maximum-likelihood fit (ours, not in the papers).
+
+The papers take the attitudes of the rests as exact and fit one sensor after the other. A housing put down by
+hand is tenths of a degree off, and where nobody knows the attitudes they must be estimated anyway. Here every
+rest has an attitude R_j of its own that accelerometer, magnetometer and gyroscope share:
+
+    acc, mag at rest j      y_j  = B + A R_j^T u + noise,        A = H^-1, |u| known               (i)
+    gyroscope at rest j     y_j  = B_g + noise                                                     (ii)
+    turn from rest i to j   log(dR(H_g, B_g)^T R_i^T R_j) = noise                                  (iii)
+    known attitude          log(R0_j^T R_j) ~ N(0, s_rot^2 I)                                      (iv)
+    level table             the housing's "up" at rest j is within level_sd of the vertical        (v)
+    vertical of the lab     the direction of u_acc is within vertical_sd of z                      (vi)
+
+Gauss-Newton on the manifold; the scale of each kind of residual is a variance component, estimated together
+with the rest (restricted maximum likelihood, Foerstner's form: sigma^2 <- v^T P v / redundancy).
+
+=============  =========================================================  ============
+name here      meaning                                                    shape
+=============  =========================================================  ============
+A, B           forward matrix H^-1 and bias, raw unit                     (3, 3), (3,)
+u              sensed vector in the laboratory, SI                        (3,)
+R              R_nh of the rests                                          (J, 3, 3)
+component      factor on the standard deviations of one kind of residual  scalar
+=============  =========================================================  ============
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from margcal.core import so3
+from margcal.core.types import Array, Kind
+from margcal.methods.preintegration import TurnBatch, preintegrate
+
+ANGLE_ERROR = 2e-4
+"""Error of an integrated turn beside the white noise, as a fraction of the angle turned (g-sensitivity,
+nonlinearity, sampling); the variance component scales it to what the data show."""
+FIRST_S_ROT = np.radians(0.3)
+"""Start of the attitude error s_rot, rad, before it is estimated."""
+MIN_S_ROT = np.radians(0.005)
+MIN_REDUNDANCY = 3.0
+"""A variance component with less redundancy than this is not estimated."""
+
+
+@dataclass(frozen=True)
+class Triad:
+    """One sensor at rest: means `y` (J, 3) raw unit with standard errors `se` (J, 3); NaN = not measured.
+
+    `A`, `B` the start, `u` (3,) its vector in the laboratory, SI. `triangular`: keep A upper triangular (the
+    frame is defined by this sensor). `u_free`: the direction of u is estimated.
+    """
+
+    y: Array
+    se: Array
+    A: Array
+    B: Array
+    u: Array
+    triangular: bool = False
+    u_free: bool = False
+
+
+@dataclass(frozen=True)
+class Gyro:
+    """The gyroscope: its means at rest and the turns ``before -> after`` between rests."""
+
+    y: Array
+    se: Array
+    H: Array
+    B: Array
+    turns: TurnBatch
+    before: Array
+    after: Array
+    noise_sd: Array
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known of the attitudes beforehand.
+
+    Attributes
+    ----------
+    R0 : ndarray (J, 3, 3) or None
+        Nominal attitudes; the deviation has the estimated standard deviation s_rot about each axis.
+    up : ndarray (J, 3) or None
+        Housing direction that points up at each rest, within `level_sd` (rad).
+    vertical_sd : float or None
+        Standard deviation (rad) of the tilt between the laboratory's z and the vertical; None: unknown.
+    s_rot : float or None
+        Fixes s_rot (rad) instead of estimating it.
+    """
+
+    R0: Array | None = None
+    up: Array | None = None
+    level_sd: float = np.radians(1.0)
+    vertical_sd: float | None = None
+    s_rot: float | None = None
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """The estimate; `covariance[kind]` (12, 12) is that of (H row by row, then B)."""
+
+    H: dict[Kind, Array]
+    B: dict[Kind, Array]
+    u: dict[Kind, Array]
+    covariance: dict[Kind, Array]
+    R: Array
+    component: dict[str, float]
+    redundancy: dict[str, float]
+    residual: dict[Kind, Array]
+    standardized: dict[str, Array]
+    s_rot: float | None
+    cost: float
+    dof: float
+    n_iter: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _State:
+    A: dict[Kind, Array]
+    B: dict[Kind, Array]
+    u: dict[Kind, Array]
+    R: Array
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where each unknown stands in the parameter vector."""
+
+    size: int
+    A: dict[Kind, slice]
+    B: dict[Kind, slice]
+    u: dict[Kind, slice]
+    R: Array  # (J, 3) columns
+    mask: dict[Kind, Array] = field(
+        default_factory=dict
+    )  # entries of A (or of the gyroscope's H) that are free
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Whitened residuals of one kind (before their component) and their Jacobian."""
+
+    name: str
+    r: Array
+    J: Array
+    rest: Array  # the rest (or turn) that each row belongs to
+
+
+def joint_fit(
+    triads: Mapping[Kind, Triad],
+    gyro: Gyro | None,
+    R: Array,
+    priors: Priors,
+    *,
+    components: Mapping[str, float] | None = None,
+    estimate_components: bool = True,
+    max_iter: int = 60,
+    tol: float = 1e-8,
+) -> JointFit:
+    """Maximum-likelihood fit of all sensors and attitudes.
+
+    Parameters
+    ----------
+    triads : mapping from 'acc', 'mag' to Triad
+    gyro : Gyro or None
+    R : ndarray (J, 3, 3)
+        Start of the attitudes, R_nh.
+    priors : Priors
+    components : mapping, optional
+        Start of the variance components (factors on the standard deviations), by name: 'acc', 'mag', 'gyr',
+        'turn', 'rot'.
+    estimate_components : bool
+        Whether they are estimated (restricted maximum likelihood) or kept.
+    max_iter : int
+    tol : float
+        Converged when no unknown moves by more than this many of its standard deviations and no component by
+        more than 1e-4 of itself.
+
+    Returns
+    -------
+    JointFit
+    """
+    layout = _lay_out(triads, gyro, len(R), priors)
+    state = _start(triads, gyro, R)
+    scale = dict(components or {})
+    # gauge and otherwise undetermined directions are held by this weak pull to the start
+    converged, n_iter = False, 0
+    blocks = _blocks(triads, gyro, priors, layout, state)
+    for n_iter in range(1, max_iter + 1):
+        N, g, parts = _normal(blocks, scale, layout.size)
+        inverse = _inverse(N)
+        step = inverse @ g
+        state, moved = _damped(triads, gyro, priors, layout, state, scale, step)
+        blocks = _blocks(triads, gyro, priors, layout, state)
+        relative = np.max(np.abs(moved) / np.sqrt(np.maximum(np.diag(inverse), 1e-300)), initial=0.0)
+        changed = 0.0
+        if estimate_components and relative < 1.0:
+            scale, changed = _update_components(blocks, scale, inverse, parts, priors)
+        if relative < tol**0.5 and changed < 1e-4:
+            converged = True
+            break
+    return _result(triads, gyro, layout, state, blocks, scale, priors, n_iter, converged)
+
+
+# --- unknowns ----------------------------------------------------------------------------------------
+
+
+def _lay_out(triads: Mapping[Kind, Triad], gyro: Gyro | None, n_rests: int, priors: Priors) -> _Layout:
+    at = 0
+    A: dict[Kind, slice] = {}
+    B: dict[Kind, slice] = {}
+    u: dict[Kind, slice] = {}
+    mask: dict[Kind, Array] = {}
+    kinds: list[tuple[Kind, bool]] = [(k, t.triangular) for k, t in triads.items()]
+    if gyro is not None:
+        kinds.append(("gyr", False))
+    for kind, triangular in kinds:
+        free = np.triu(np.ones((3, 3), dtype=bool)) if triangular else np.ones((3, 3), dtype=bool)
+        mask[kind] = np.flatnonzero(free)
+        A[kind] = slice(at, at := at + len(mask[kind]))
+        B[kind] = slice(at, at := at + 3)
+    for kind, triad in triads.items():
+        if triad.u_free:
+            u[kind] = slice(at, at := at + 2)
+    R = at + np.arange(3 * n_rests).reshape(n_rests, 3)
+    return _Layout(at + 3 * n_rests, A, B, u, R, mask)
+
+
+def _start(triads: Mapping[Kind, Triad], gyro: Gyro | None, R: Array) -> _State:
+    A = {k: t.A for k, t in triads.items()}
+    B = {k: t.B for k, t in triads.items()}
+    if gyro is not None:
+        A["gyr"], B["gyr"] = gyro.H, gyro.B
+    return _State(A, B, {k: t.u for k, t in triads.items()}, R)
+
+
+def _moved(layout: _Layout, state: _State, step: Array) -> _State:
+    A, B, u = dict(state.A), dict(state.B), dict(state.u)
+    for kind in A:
+        flat = A[kind].ravel().copy()
+        flat[layout.mask[kind]] += step[layout.A[kind]]
+        A[kind], B[kind] = flat.reshape(3, 3), B[kind] + step[layout.B[kind]]
+    for kind, where in layout.u.items():
+        u[kind] = so3.exp(_tangent(u[kind]) @ step[where]) @ u[kind]
+    return _State(A, B, u, state.R @ so3.exp(step[layout.R]))
+
+
+def _tangent(u: Array) -> Array:
+    """Two unit vectors across `u`, as columns (3, 2)."""
+    return np.linalg.svd(u[None, :])[2][1:].T
+
+
+# --- residuals ---------------------------------------------------------------------------------------
+
+
+def _blocks(
+    triads: Mapping[Kind, Triad], gyro: Gyro | None, priors: Priors, layout: _Layout, state: _State
+) -> list[_Block]:
+    blocks = [_triad_block(kind, triad, layout, state) for kind, triad in triads.items()]
+    if gyro is not None:
+        blocks += [_gyro_rest_block(gyro, layout, state), _turn_block(gyro, layout, state)]
+    if priors.R0 is not None:
+        blocks.append(_attitude_block(priors.R0, layout, state))
+    if priors.up is not None:
+        blocks.append(_level_block(priors, layout, state))
+    if priors.vertical_sd is not None and "acc" in layout.u:
+        blocks.append(_vertical_block(priors.vertical_sd, layout, state))
+    return [b for b in blocks if len(b.r)]
+
+
+def _triad_block(kind: Kind, triad: Triad, layout: _Layout, state: _State) -> _Block:
+    """(i): (y - B - A R^T u) / se."""
+    rest = np.flatnonzero(np.isfinite(triad.y).all(axis=1))
+    A, u = state.A[kind], state.u[kind]
+    R = state.R[rest]
+    v = np.einsum("jba,b->ja", R, u)  # R^T u
+    w = 1 / triad.se[rest]
+    r = w * (triad.y[rest] - state.B[kind] - v @ A.T)
+    J = np.zeros((len(rest), 3, layout.size))
+    mask = layout.mask[kind]
+    for column, entry in zip(range(layout.A[kind].start, layout.A[kind].stop), mask):
+        row, col = divmod(int(entry), 3)
+        J[:, row, column] = -v[:, col]
+    J[:, :, layout.B[kind]] = -np.eye(3)
+    # R <- R exp(d): R^T u changes by (R^T u) x d
+    _put(J, layout.R[rest], -A @ so3.skew(v))
+    if kind in layout.u:
+        # u changes by t x u for the small rotation t = T p
+        change = np.einsum("jba,bc->jac", R, -so3.skew(u) @ _tangent(u))
+        J[:, :, layout.u[kind]] = -A @ change
+    J *= w[:, :, None]
+    return _Block(kind, r.ravel(), J.reshape(-1, layout.size), np.repeat(rest, 3))
+
+
+def _gyro_rest_block(gyro: Gyro, layout: _Layout, state: _State) -> _Block:
+    """(ii): (y - B_g) / se."""
+    rest = np.flatnonzero(np.isfinite(gyro.y).all(axis=1))
+    w = 1 / gyro.se[rest]
+    J = np.zeros((len(rest), 3, layout.size))
+    J[:, :, layout.B["gyr"]] = -w[:, :, None] * np.eye(3)
+    r = w * (gyro.y[rest] - state.B["gyr"])
+    return _Block("gyr", r.ravel(), J.reshape(-1, layout.size), np.repeat(rest, 3))
+
+
+def _turn_block(gyro: Gyro, layout: _Layout, state: _State) -> _Block:
+    """(iii): log(dR^T R_before^T R_after), whitened by the noise of the integration."""
+    H, B = state.A["gyr"], state.B["gyr"]
+    pre = preintegrate(gyro.turns.y, gyro.turns.dt, H, B, gyro.noise_sd)
+    back = np.swapaxes(pre.dR, -1, -2)
+    r = so3.log(back @ np.swapaxes(state.R[gyro.before], -1, -2) @ state.R[gyro.after])
+    left, right = so3.left_jacobian_inverse(r), so3.left_jacobian_inverse(-r)
+    J = np.zeros((len(r), 3, layout.size))
+    J[:, :, layout.A["gyr"]] = -left @ pre.J_H
+    J[:, :, layout.B["gyr"]] = -left @ pre.J_B
+    _put(J, layout.R[gyro.before], -left @ back)
+    _put(J, layout.R[gyro.after], right)
+    rate = np.linalg.norm((gyro.turns.y - B) @ H.T, axis=-1)
+    angle = np.sum(rate * gyro.turns.dt, axis=-1)
+    C = pre.C + (ANGLE_ERROR * angle)[:, None, None] ** 2 * np.eye(3)
+    W = np.linalg.inv(np.linalg.cholesky(C))
+    r, J = np.einsum("tij,tj->ti", W, r), W @ J
+    return _Block("turn", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 3))
+
+
+def _attitude_block(R0: Array, layout: _Layout, state: _State) -> _Block:
+    """(iv): log(R0^T R), in units of rad (its component is s_rot)."""
+    r = so3.log(np.swapaxes(R0, -1, -2) @ state.R)
+    J = np.zeros((len(r), 3, layout.size))
+    _put(J, layout.R, so3.left_jacobian_inverse(-r))
+    return _Block("rot", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 3))
+
+
+def _level_block(priors: Priors, layout: _Layout, state: _State) -> _Block:
+    """(v): components of R^T z across the housing direction that is up, over level_sd."""
+    assert priors.up is not None
+    v = state.R[:, 2, :]  # R^T z
+    across = np.stack([_tangent(c).T for c in priors.up])  # (J, 2, 3)
+    r = np.einsum("jkc,jc->jk", across, v) / priors.level_sd
+    J = np.zeros((len(r), 2, layout.size))
+    _put(J, layout.R, across @ so3.skew(v) / priors.level_sd)
+    return _Block("level", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 2))
+
+
+def _vertical_block(sd: float, layout: _Layout, state: _State) -> _Block:
+    """(vi): horizontal components of the direction of u_acc, over sd."""
+    u = state.u["acc"]
+    J = np.zeros((2, layout.size))
+    J[:, layout.u["acc"]] = (-so3.skew(u) @ _tangent(u))[:2] / (np.linalg.norm(u) * sd)
+    return _Block("vertical", u[:2] / (np.linalg.norm(u) * sd), J, np.zeros(2, dtype=int))
+
+
+def _put(J: Array, columns: Array, values: Array) -> None:
+    """``J[i, :, columns[i]] += values[i]`` for the three columns of each rest or turn i."""
+    i = np.arange(len(J))
+    for k in range(3):
+        J[i, :, columns[:, k]] += values[:, :, k]
+
+
+# --- normal equations and variance components --------------------------------------------------------
+
+
+def _sigma(name: str, scale: Mapping[str, float]) -> float:
+    return scale.get(name, FIRST_S_ROT if name == "rot" else 1.0)
+
+
+def _normal(
+    blocks: Sequence[_Block], scale: Mapping[str, float], size: int
+) -> tuple[Array, Array, dict[str, Array]]:
+    parts = {b.name: b.J.T @ b.J / _sigma(b.name, scale) ** 2 for b in blocks}
+    g = np.zeros(size)
+    for b in blocks:
+        g -= b.J.T @ b.r / _sigma(b.name, scale) ** 2
+    return np.sum(list(parts.values()), axis=0), g, parts
+
+
+def _inverse(N: Array) -> Array:
+    """Pseudo-inverse of the scaled normal matrix: undetermined (gauge) directions stay where they are."""
+    d = np.sqrt(np.maximum(np.diag(N), 1e-300))
+    values, vectors = np.linalg.eigh(N / np.outer(d, d))
+    good = values > 1e-12 * values[-1]
+    scaled = vectors[:, good] / d[:, None]
+    return (scaled / values[good]) @ scaled.T
+
+
+def _cost(blocks: Sequence[_Block], scale: Mapping[str, float]) -> float:
+    return float(sum(b.r @ b.r / _sigma(b.name, scale) ** 2 for b in blocks))
+
+
+def _damped(
+    triads: Mapping[Kind, Triad],
+    gyro: Gyro | None,
+    priors: Priors,
+    layout: _Layout,
+    state: _State,
+    scale: Mapping[str, float],
+    step: Array,
+) -> tuple[_State, Array]:
+    """The full step, halved while it raises the cost."""
+    before = _cost(_blocks(triads, gyro, priors, layout, state), scale)
+    for _ in range(8):
+        trial = _moved(layout, state, step)
+        if _cost(_blocks(triads, gyro, priors, layout, trial), scale) <= before * (1 + 1e-9) + 1e-12:
+            return trial, step
+        step = step / 2
+    return state, np.zeros_like(step)
+
+
+def _update_components(
+    blocks: Sequence[_Block],
+    scale: dict[str, float],
+    inverse: Array,
+    parts: Mapping[str, Array],
+    priors: Priors,
+) -> tuple[dict[str, float], float]:
+    """sigma^2 <- v^T P v / redundancy for every component that the data can tell."""
+    new, changed = dict(scale), 0.0
+    for b in blocks:
+        fixed = b.name in ("level", "vertical") or (b.name == "rot" and priors.s_rot is not None)
+        if fixed:
+            if b.name == "rot" and priors.s_rot is not None:
+                new["rot"] = priors.s_rot
+            continue
+        redundancy = _redundancy(b, inverse, parts)
+        if redundancy < MIN_REDUNDANCY:
+            continue
+        sigma = float(np.sqrt(b.r @ b.r / redundancy))
+        # scatter over sqrt(n) is the least error that a mean can have; s_rot has a floor for the algebra's sake
+        sigma = max(sigma, MIN_S_ROT if b.name == "rot" else 0.7)
+        changed = max(changed, abs(sigma / _sigma(b.name, scale) - 1))
+        new[b.name] = sigma
+    return new, changed
+
+
+def _redundancy(block: _Block, inverse: Array, parts: Mapping[str, Array]) -> float:
+    return len(block.r) - float(np.sum(inverse * parts[block.name]))
+
+
+# --- result ------------------------------------------------------------------------------------------
+
+
+def _result(
+    triads: Mapping[Kind, Triad],
+    gyro: Gyro | None,
+    layout: _Layout,
+    state: _State,
+    blocks: Sequence[_Block],
+    scale: dict[str, float],
+    priors: Priors,
+    n_iter: int,
+    converged: bool,
+) -> JointFit:
+    N, _, parts = _normal(blocks, scale, layout.size)
+    inverse = _inverse(N)
+    H: dict[Kind, Array] = {}
+    covariance: dict[Kind, Array] = {}
+    residual: dict[Kind, Array] = {}
+    for kind in triads:
+        H[kind] = np.linalg.inv(state.A[kind])
+        covariance[kind] = _model_covariance(layout, inverse, kind, H[kind], forward=True)
+        v = np.einsum("jba,b->ja", state.R, state.u[kind])
+        off = (triads[kind].y - state.B[kind]) @ H[kind].T - v
+        residual[kind] = np.linalg.norm(off, axis=-1)
+    if gyro is not None:
+        H["gyr"] = state.A["gyr"]
+        covariance["gyr"] = _model_covariance(layout, inverse, "gyr", H["gyr"], forward=False)
+        pre = preintegrate(gyro.turns.y, gyro.turns.dt, H["gyr"], state.B["gyr"])
+        net = np.swapaxes(state.R[gyro.before], -1, -2) @ state.R[gyro.after]
+        residual["gyr"] = so3.angle_between(pre.dR, net)
+    redundancy = {b.name: _redundancy(b, inverse, parts) for b in blocks}
+    return JointFit(
+        H=H,
+        B=dict(state.B),
+        u=dict(state.u),
+        covariance=covariance,
+        R=state.R,
+        component={b.name: _sigma(b.name, scale) for b in blocks},
+        redundancy=redundancy,
+        residual=residual,
+        standardized={b.name: _standardized(b, scale, inverse) for b in blocks},
+        s_rot=_sigma("rot", scale) if priors.R0 is not None else None,
+        cost=_cost(blocks, scale),
+        dof=float(sum(redundancy.values())),
+        n_iter=n_iter,
+        converged=converged,
+    )
+
+
+def _model_covariance(layout: _Layout, inverse: Array, kind: Kind, H: Array, *, forward: bool) -> Array:
+    """Covariance of (H row by row, then B) from that of (A, B): dH = -H dA H."""
+    columns = np.r_[layout.A[kind], layout.B[kind]]
+    n = len(layout.mask[kind])
+    to = np.zeros((12, n + 3))
+    full = -np.kron(H, H.T) if forward else np.eye(9)
+    to[:9, :n] = full[:, layout.mask[kind]]
+    to[9:, n:] = np.eye(3)
+    C = to @ inverse[np.ix_(columns, columns)] @ to.T
+    return (C + C.T) / 2
+
+
+def _standardized(block: _Block, scale: Mapping[str, float], inverse: Array) -> Array:
+    """Largest standardized residual (over its own standard deviation after the fit) of each rest or turn."""
+    J = block.J / _sigma(block.name, scale)
+    leverage = np.einsum("ip,pq,iq->i", J, inverse, J)
+    sd = np.sqrt(np.maximum(1 - leverage, 1e-3))
+    z = np.abs(block.r / _sigma(block.name, scale)) / sd
+    worst = np.zeros(int(block.rest.max()) + 1)
+    np.maximum.at(worst, block.rest, z)
+    return worst
