@@ -99,16 +99,12 @@ def checked_stream(
     """
     kind, where = stream.kind, f"{where}{stream.kind}"
     if stream.unit not in UNITS[kind]:
-        raise InputError(
-            f"{where}: unknown unit {printable(stream.unit)!r}; {kind} may be in {', '.join(UNITS[kind])}"
-        )
+        raise InputError(f"{where}: unknown unit {printable(stream.unit)!r}; {kind} may be in {', '.join(UNITS[kind])}")
     if len(stream.t) == 0:
         raise InputError(f"{where}: no samples")
     if not np.isfinite(stream.y.sum()) and np.isinf(stream.y).any():
         row = int(np.argmax(np.isinf(stream.y).any(axis=1)))
-        raise InputError(
-            f"{where}: infinite reading in sample {row + 1} (t = {stream.t[row]:.6g} s); take the row out"
-        )
+        raise InputError(f"{where}: infinite reading in sample {row + 1} (t = {stream.t[row]:.6g} s); take the row out")
     index, issues = _checked_time(stream.t, where, sort=sort, trust_clock=trust_clock)
     issues = tuple(replace(i, sensor=kind) for i in issues)
     if index is None:

@@ -116,9 +116,7 @@ class Table:
         while True:
             ragged.clear()
             try:
-                batches = self._parse(
-                    dialect, columns, take, dropped, ragged, skip_bad - len(dropped), progress
-                )
+                batches = self._parse(dialect, columns, take, dropped, ragged, skip_bad - len(dropped), progress)
                 if not skip_bad:
                     yield from batches
                     return
@@ -200,8 +198,7 @@ class Table:
             return BadCell(f"{text}; correct it, empty the cell, or give --skip-bad N", row, int(bad[1]))
         if fields := re.search(r"Expected (\d+) columns, got (\d+)", message):
             return InputError(
-                f"{place}: {fields[2]} fields where the header has {fields[1]}; correct the line, or give "
-                "--skip-bad N"
+                f"{place}: {fields[2]} fields where the header has {fields[1]}; correct the line, or give --skip-bad N"
             )
         return InputError(f"{place}: cannot be read as a table ({printable(message, 120)})")
 
@@ -270,13 +267,7 @@ def _refused(path: Path) -> Iterator[None]:
 def _is_number_type(kind: pa.DataType) -> bool:
     import pyarrow.types as pt
 
-    return (
-        pt.is_integer(kind)
-        or pt.is_floating(kind)
-        or pt.is_boolean(kind)
-        or pt.is_decimal(kind)
-        or pt.is_null(kind)
-    )
+    return pt.is_integer(kind) or pt.is_floating(kind) or pt.is_boolean(kind) or pt.is_decimal(kind) or pt.is_null(kind)
 
 
 def numbers(array: pa.Array) -> Array:

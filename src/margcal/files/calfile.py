@@ -186,9 +186,7 @@ def _plain(data: bytes, name: str) -> Any:
         return dict(pairs)
 
     def refuse(word: str) -> float:
-        raise InputError(
-            f"{name}: {word} is not a number that JSON knows; a calibration holds finite numbers"
-        )
+        raise InputError(f"{name}: {word} is not a number that JSON knows; a calibration holds finite numbers")
 
     def finite(text: str) -> float:
         value = float(text)
@@ -198,16 +196,12 @@ def _plain(data: bytes, name: str) -> Any:
 
     def whole(text: str) -> int | float:
         if len(text) > 300:
-            raise InputError(
-                f"{name}: a number of {len(text)} digits ({text[:10]}...); this is no calibration"
-            )
+            raise InputError(f"{name}: a number of {len(text)} digits ({text[:10]}...); this is no calibration")
         return int(text)
 
     try:
         text = data.decode("utf-8")
-        return json.loads(
-            text, object_pairs_hook=unique, parse_constant=refuse, parse_float=finite, parse_int=whole
-        )
+        return json.loads(text, object_pairs_hook=unique, parse_constant=refuse, parse_float=finite, parse_int=whole)
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: is not UTF-8 text at byte {error.start}; this is no JSON file") from error
     except json.JSONDecodeError as error:
@@ -227,9 +221,7 @@ def _check_version(plain: Any, name: str) -> None:
             f"{name}: is of version {version}, this margcal reads up to version {VERSION}; it needs a newer margcal"
         )
     if version != VERSION or isinstance(version, bool) or not isinstance(version, int):
-        raise InputError(
-            f"{name}: version {printable(version)!r} is not known; expected {VERSION} - at `$.version`"
-        )
+        raise InputError(f"{name}: version {printable(version)!r} is not known; expected {VERSION} - at `$.version`")
 
 
 def _in_words(message: str) -> str:
@@ -280,9 +272,7 @@ def check_model(model: SensorModel, name: str) -> None:
     """
     where = f"$.{model.kind}"
     if model.H.shape != (3, 3) or model.B.shape != (3,):
-        raise InputError(
-            f"{name}: H is {model.H.shape} and B {model.B.shape}; a file holds one node - at `{where}`"
-        )
+        raise InputError(f"{name}: H is {model.H.shape} and B {model.B.shape}; a file holds one node - at `{where}`")
     for field in ("H", "B", "covariance", "reference_vector"):
         value = getattr(model, field)
         if value is not None and not np.isfinite(value).all():

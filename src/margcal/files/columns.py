@@ -69,9 +69,7 @@ def find_columns(names: Sequence[str], units: Mapping[str, str] | None, file: st
     for name, count in Counter(k for k in keys if k).items():
         if count > 1:
             places = ", ".join(str(k + 1) for k, n in enumerate(keys) if n == name)
-            raise InputError(
-                f"{file}: column name {printable(name)!r} is there twice (columns {places}); rename one"
-            )
+            raise InputError(f"{file}: column name {printable(name)!r} is there twice (columns {places}); rename one")
     place = {n: k for k, n in enumerate(lower)}
     sensors: dict[Kind, SensorColumns] = {}
     for kind in KINDS:
@@ -101,9 +99,7 @@ def check_units(units: Mapping[str, str] | None) -> None:
         if kind not in UNITS:
             raise InputError(f"units: {printable(kind)!r} is no sensor; use {', '.join(KINDS)}")
         if unit not in UNITS[kind]:
-            raise InputError(
-                f"units: {kind} cannot be in {printable(unit)!r}; use one of {', '.join(UNITS[kind])}"
-            )
+            raise InputError(f"units: {kind} cannot be in {printable(unit)!r}; use one of {', '.join(UNITS[kind])}")
 
 
 def _find_sensor(kind: Kind, names: Sequence[str], declared: str | None, file: str) -> SensorColumns | None:
@@ -176,7 +172,5 @@ def _find_position(names: Sequence[str], file: str) -> tuple[tuple[int, ...] | N
     if not axes:
         return None, 1.0
     if len(units) > 1 or len(axes) < 3:
-        raise InputError(
-            f"{file}: the reference position needs ref_p_x, ref_p_y and ref_p_z in one unit (m or mm)"
-        )
+        raise InputError(f"{file}: the reference position needs ref_p_x, ref_p_y and ref_p_z in one unit (m or mm)")
     return (axes["x"], axes["y"], axes["z"]), 1.0 if units == {"m"} else 1e-3

@@ -130,9 +130,7 @@ def _faces(columns: dict[str, list[Any]], file: str) -> dict[str, Any]:
     up = [_axis(v, row, "up", file) for row, v in enumerate(columns["up"])]
     missing = next((row for row, v in enumerate(up) if v is None), None)
     if missing is not None:
-        raise InputError(
-            f"{file}: row {missing + 1}: up is empty; give the housing axis that points up, such as +z"
-        )
+        raise InputError(f"{file}: row {missing + 1}: up is empty; give the housing axis that points up, such as +z")
     front = None
     if "front" in columns and _filled(columns, ["front"]):
         front = tuple(_axis(v, row, "front", file) for row, v in enumerate(columns["front"]))
@@ -151,9 +149,7 @@ def _axis(cell: Any, row: int, name: str, file: str) -> str | None:
     text = str(cell).lstrip("'").strip().lower().replace("\u2212", "-")
     text = "+" + text if text in ("x", "y", "z") else text
     if text not in AXES:
-        raise InputError(
-            f"{file}: row {row + 1}: {name} is {printable(cell, 40)!r}; expected one of {', '.join(AXES)}"
-        )
+        raise InputError(f"{file}: row {row + 1}: {name} is {printable(cell, 40)!r}; expected one of {', '.join(AXES)}")
     return text
 
 

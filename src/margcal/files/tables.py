@@ -102,9 +102,7 @@ def read(
         text = f"{recording.source}: no sensor in {', '.join(skipped)}; left out"
         recording = replace(recording, issues=(*recording.issues, Issue("table-skipped", "note", text)))
     if rate is not None and len(recording.files) > 1:
-        raise InputError(
-            f"{recording.source}: its tables have clocks of their own; a rate cannot stand for all"
-        )
+        raise InputError(f"{recording.source}: its tables have clocks of their own; a rate cannot stand for all")
     return checked_recording(recording, sort=sort, trust_clock=rate is not None)
 
 

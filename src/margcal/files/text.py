@@ -34,9 +34,7 @@ _BINARY = {
     b"BZh": "packed with bzip2; unpack it",
     b"\xfd7zXZ": "packed with xz; unpack it",
 }
-_NUMERIC_NAME = re.compile(
-    r"t_s|temp_degc|(acc|gyr|mag)_[xyz].*|(ref_)?q[wxyz]|ref_p_.*|start_s|stop_s", re.I
-)
+_NUMERIC_NAME = re.compile(r"t_s|temp_degc|(acc|gyr|mag)_[xyz].*|(ref_)?q[wxyz]|ref_p_.*|start_s|stop_s", re.I)
 
 
 class TextLines(io.RawIOBase):
@@ -114,9 +112,7 @@ class TextLines(io.RawIOBase):
                         )
                     yield block
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise InputError(
-                f"{self.name}: the gzip file is damaged or cut ({error}); fetch it again"
-            ) from error
+            raise InputError(f"{self.name}: the gzip file is damaged or cut ({error}); fetch it again") from error
 
     def _utf8_blocks(self) -> Iterator[bytes]:
         """Blocks decoded from whatever the file is in, line ends made `\\n` where they are `\\r` only."""
@@ -145,9 +141,7 @@ class TextLines(io.RawIOBase):
             cut = block.rfind(b"\n") + 1
             block, tail = block[:cut], block[cut:]
             if len(tail) > LONGEST_LINE:
-                raise InputError(
-                    f"{self.name}: a line is longer than {LONGEST_LINE >> 20} MB; this is no table"
-                )
+                raise InputError(f"{self.name}: a line is longer than {LONGEST_LINE >> 20} MB; this is no table")
             if block:
                 yield block
         if tail:
@@ -216,11 +210,7 @@ def _encoding(first: bytes, name: str) -> tuple[str, int]:
             return encoding, len(mark)
     head = first[:4096]
     for start, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if (
-            len(head) > 8
-            and head[start::2].count(0) > 0.9 * len(head[start::2])
-            and not head[1 - start :: 2].count(0)
-        ):
+        if len(head) > 8 and head[start::2].count(0) > 0.9 * len(head[start::2]) and not head[1 - start :: 2].count(0):
             return encoding, 0
     if head.count(0) > 8 or sum(b < 9 or 13 < b < 32 for b in head) > 0.1 * len(head):
         raise InputError(f"{name}: this is a binary file, not a text table; expected CSV or Parquet")

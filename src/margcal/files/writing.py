@@ -26,9 +26,7 @@ Write = Callable[["pa.RecordBatch"], None]
 def check_suffix(path: Path) -> None:
     """Refuse a name whose suffix is no table's."""
     if not is_parquet(path) and not path.name.lower().endswith(_TEXT):
-        raise InputError(
-            f"{printable(path.name)}: a table is written as .csv or .parquet; give it that suffix"
-        )
+        raise InputError(f"{printable(path.name)}: a table is written as .csv or .parquet; give it that suffix")
 
 
 def write_table(
@@ -144,9 +142,7 @@ def _write_csv(batch: pa.RecordBatch, file: Any, delimiter: str) -> None:
                 quoting = "needed"
         elif not _is_simple(column):
             quoting = "needed"
-    pc.write_csv(
-        batch, file, pc.WriteOptions(include_header=False, delimiter=delimiter, quoting_style=quoting)
-    )
+    pc.write_csv(batch, file, pc.WriteOptions(include_header=False, delimiter=delimiter, quoting_style=quoting))
 
 
 def _is_simple(column: pa.Array) -> bool:

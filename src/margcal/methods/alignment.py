@@ -67,9 +67,7 @@ def rotation_from_dip(v: Array, up: Array) -> Array | None:
     return so3.nearest_rotation(X if np.linalg.det(X) > 0 else -X)
 
 
-def rotation_from_rates(
-    t: Array, v: Array, t_gyr: Array, rate: Array, *, delays: Array = DELAYS_S
-) -> Alignment:
+def rotation_from_rates(t: Array, v: Array, t_gyr: Array, rate: Array, *, delays: Array = DELAYS_S) -> Alignment:
     """Omega, and the magnetometer's delay, from a continuous motion.
 
     Parameters
@@ -125,9 +123,7 @@ def _solve(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Array, delay: f
     before, after = unit[edges[:-1]], unit[edges[1:]]
     use = (batch.dt > 0).sum(axis=1) >= 2
     if use.sum() < 8:
-        raise DataError(
-            "the motion is too short to align the magnetometer with the gyroscope", (_too_short(),)
-        )
+        raise DataError("the motion is too short to align the magnetometer with the gyroscope", (_too_short(),))
     fit = propagate_gravity(
         batch.select(use),
         before[use],

@@ -76,9 +76,7 @@ def optimum(Z: Array, R: Array) -> tuple[Array, Array, Array]:
     A = np.empty_like(M)
     A[..., 2] = E[..., 2, :] / L[..., 2, 2, None]
     A[..., 1] = (E[..., 1, :] - A[..., 2] * L[..., 2, 1, None]) / L[..., 1, 1, None]
-    A[..., 0] = (E[..., 0, :] - A[..., 1] * L[..., 1, 0, None] - A[..., 2] * L[..., 2, 0, None]) / L[
-        ..., 0, 0, None
-    ]
+    A[..., 0] = (E[..., 0, :] - A[..., 1] * L[..., 1, 0, None] - A[..., 2] * L[..., 2, 0, None]) / L[..., 0, 0, None]
     A, u = positive(A, u)
     return u, A, eigenvalues
 
@@ -114,9 +112,7 @@ def _adjugate_column(a: Array, b: Array, c: Array, d: Array, e: Array, f: Array)
     """Null vector of [[a d e], [d b f], [e f c]]: the longest column of its adjugate, normalised."""
     ab, ac, bc = a * b - d * d, a * c - e * e, b * c - f * f  # diagonal: squares of the vector's components
     ade, adf, aef = e * f - d * c, d * f - b * e, d * e - a * f
-    columns = np.stack(
-        [np.stack([bc, ade, adf], -1), np.stack([ade, ac, aef], -1), np.stack([adf, aef, ab], -1)], -2
-    )
+    columns = np.stack([np.stack([bc, ade, adf], -1), np.stack([ade, ac, aef], -1), np.stack([adf, aef, ab], -1)], -2)
     best = np.argmax(np.stack([bc, ac, ab], -1), axis=-1)
     v = np.take_along_axis(columns, best[..., None, None], axis=-2)[..., 0, :]
     length = np.sqrt(np.einsum("...i,...i->...", v, v))

@@ -243,10 +243,10 @@ def _first_order(z: Array, K: Array, b: Array) -> Array:
 
 
 def _block_covariance(z: Array, K: Array, b: Array, distance: Array, weights: Array) -> Array:
-    """Covariance (9, 9) of (six of K, b): ``A^-1 (sum over blocks of g g') A^-1``, g a block's sum of scores."""
+    """Covariance (9, 9) of (six of K, b): ``N^-1 (sum of g g') N^-1``, g the sum of a block's scores."""
     v = (z - b) / np.linalg.norm((z - b) @ K, axis=1)[:, None]  # the point on the surface along the ray
     J = quadric.distance_jacobian(v + b, K, b)
-    normal = np.einsum("np,n,nq->pq", J, weights, J)
+    normal = J.T @ (J * weights[:, None])
     scores = J * (weights * distance)[:, None]
     n_blocks = min(BLOCKS, len(z) // 3)
     starts = np.linspace(0, len(z), n_blocks, endpoint=False).astype(int)

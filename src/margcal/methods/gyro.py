@@ -140,9 +140,16 @@ def _problem(
     mean, root = np.zeros(3) if B0 is None else np.asarray(B0, dtype=np.float64), None
     if bias_prior is not None:
         mean = np.asarray(bias_prior[0], dtype=np.float64)
-        root = np.linalg.inv(np.linalg.cholesky(np.asarray(bias_prior[1], dtype=np.float64)))
+        root = _inverse_root(np.asarray(bias_prior[1], dtype=np.float64))
     noise = None if sd is None else np.asarray(sd, dtype=np.float64) * np.ones(3)
     return Problem(batch, measure, dof.astype(np.float64), mean, root, noise, sigma_angle)
+
+
+def _inverse_root(covariance: Array) -> Array:
+    power, axes = np.linalg.eigh(covariance)
+    if not (np.isfinite(power).all() and power[0] > 0):
+        raise InputError("the covariance of the bias prior is not positive definite; give each axis a spread")
+    return np.asarray(axes.T / np.sqrt(power)[:, None])
 
 
 def gauss_newton(
@@ -251,13 +258,14 @@ def propagate_gravity(
 
     Notes
     -----
-    Gravity alone tells two angles of a turn: five turns at least, and turns about the vertical tell nothing.
+    Gravity alone tells two angles of a turn: five turns at least, and a turn about the vertical does not
+    tell the gain along it.
     """
     v_before, v_after = _directions(before), _directions(after)
     if v_before.shape != v_after.shape:
         raise InputError(f"directions before {v_before.shape} and after {v_after.shape} the turns do not match")
-    known = np.isfinite(v_before).all(axis=-1) & np.isfinite(v_after).all(axis=-1)
-    v_before, v_after = (np.where(known[..., None], v, 0.0) for v in (v_before, v_after))
+    known = np.asarray(np.isfinite(v_before + v_after).all(axis=-1))
+    v_before, v_after = np.where(known[..., None], v_before, 0.0), np.where(known[..., None], v_after, 0.0)
     problem = _problem(
         turns, direction_measure(v_before, v_after), 2 * known.sum(axis=1), B0, bias_prior, sd, sigma_angle
     )
@@ -269,7 +277,7 @@ def propagate_gravity(
             yield linear_start(problem.batch, along, B=problem.prior_mean, before=before, after=after)
 
     run = best_run(problem, starts(), max_iter, tol)
-    angle = _angles(v_before, np.einsum("tij,tmj->tmi", run.point.step.dR, v_after))
+    angle: Array = _angles(v_before, np.einsum("tij,tmj->tmi", run.point.step.dR, v_after))
     residual = np.sqrt(np.sum(angle**2 * known, axis=1) / np.maximum(known.sum(axis=1), 1))
     return _to_fit(problem, run, residual, "propagate-gravity", raw_unit)
 
@@ -282,7 +290,7 @@ def _directions(v: ArrayLike) -> Array:
 
 
 def _angles(a: Array, b: Array) -> Array:
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
 
 
 def known_rotations(R: ArrayLike, turns: Sequence[Turn]) -> Array:

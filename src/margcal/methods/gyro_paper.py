@@ -20,6 +20,7 @@ one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -195,12 +196,35 @@ class _Cost:
         return 2 * self.jacobian(X).T @ self.residuals(X)
 
 
-def _prepare(
-    turns: Sequence[Turn] | TurnBatch, dR: ArrayLike | None, H0: ArrayLike, B: ArrayLike | None, q: ArrayLike | None
-) -> tuple[TurnBatch, Array, Array]:
-    batch, start = pad(turns), np.asarray(H0, dtype=np.float64)
-    known = labels(batch, np.asarray(dR), start, B) if q is None else np.asarray(q, dtype=np.float64)
-    return batch, known, start
+class _Path:
+    """One descent on (43): its cost, in units of `scale`, and the iterates of the unfolded H."""
+
+    def __init__(
+        self,
+        turns: Sequence[Turn] | TurnBatch,
+        dR: ArrayLike | None,
+        H0: ArrayLike,
+        B: ArrayLike | None,
+        q: ArrayLike | None,
+        scale: float,
+    ) -> None:
+        self.batch, self.B, self.scale = pad(turns), B, scale
+        start = np.asarray(H0, dtype=np.float64)
+        self.q = labels(self.batch, np.asarray(dR), start, B) if q is None else np.asarray(q, dtype=np.float64)
+        bias = None if B is None else scale * np.asarray(B, dtype=np.float64)
+        self.cost = _Cost(TurnBatch(scale * self.batch.y, self.batch.dt), self.q, bias)
+        self.start = start.ravel() / scale
+        self.iterates = [self.start]
+
+    def keep(self, X: Array) -> None:
+        if not np.array_equal(X, self.iterates[-1]):
+            self.iterates.append(np.array(X))
+
+    def fit(self, method: str, raw_unit: str) -> Fit:
+        path = self.iterates if len(self.iterates) > 1 else self.iterates * 2
+        history = self.scale * np.stack(path).reshape(-1, 3, 3)
+        found = _fit(self.batch, self.q, history, self.B, method, raw_unit)
+        return replace(found, history={**found.history, "evaluations": np.array(self.cost.evaluations)})
 
 
 def quasi_newton(
@@ -212,6 +236,7 @@ def quasi_newton(
     q: ArrayLike | None = None,
     n_iter: int = 200,
     numerical: bool = False,
+    scale: float = 1.0,
     raw_unit: str = "count",
 ) -> Fit:
     """BFGS on (43): SciPy's ``minimize(method='BFGS')``, every iterate kept.
@@ -222,17 +247,17 @@ def quasi_newton(
     """
     from scipy.optimize import minimize
 
-    batch, known, start = _prepare(turns, dR, H0, B, q)
-    cost, path = _Cost(batch, known, B), [start.ravel()]
+    path = _Path(turns, dR, H0, B, q, scale)
+    cost = path.cost
     minimize(
         cost.value,
-        start.ravel(),
+        path.start,
         jac=None if numerical else cost.gradient,
         method="BFGS",
-        callback=lambda x: path.append(np.array(x)),
+        callback=path.keep,
         options={"maxiter": n_iter, "gtol": 1e-10},
     )
-    return _baseline(batch, known, path, B, "bfgs", cost, raw_unit)
+    return path.fit("bfgs", raw_unit)
 
 
 def nelder_mead(
@@ -243,6 +268,7 @@ def nelder_mead(
     B: ArrayLike | None = None,
     q: ArrayLike | None = None,
     n_iter: int = 4000,
+    scale: float = 1.0,
     raw_unit: str = "count",
 ) -> Fit:
     """Nelder-Mead on (43): SciPy's ``minimize(method='Nelder-Mead')``, the best vertex of every iteration kept.
@@ -252,16 +278,16 @@ def nelder_mead(
     """
     from scipy.optimize import minimize
 
-    batch, known, start = _prepare(turns, dR, H0, B, q)
-    cost, path = _Cost(batch, known, B), [start.ravel()]
+    path = _Path(turns, dR, H0, B, q, scale)
+    cost = path.cost
     minimize(
         cost.value,
-        start.ravel(),
+        path.start,
         method="Nelder-Mead",
-        callback=lambda x: path.append(np.array(x)),
+        callback=path.keep,
         options={"maxiter": n_iter, "maxfev": 4 * n_iter, "xatol": 1e-9, "fatol": 1e-12},
     )
-    return _baseline(batch, known, path, B, "nelder-mead", cost, raw_unit)
+    return path.fit("nelder-mead", raw_unit)
 
 
 def trust_region(
@@ -273,6 +299,7 @@ def trust_region(
     q: ArrayLike | None = None,
     n_iter: int = 200,
     numerical: bool = False,
+    scale: float = 1.0,
     raw_unit: str = "count",
 ) -> Fit:
     """Trust region on (43): SciPy's ``least_squares(method='trf')``, every accepted iterate kept.
@@ -284,28 +311,23 @@ def trust_region(
     """
     from scipy.optimize import least_squares
 
-    batch, known, start = _prepare(turns, dR, H0, B, q)
-    cost, path = _Cost(batch, known, B), [start.ravel()]
+    path = _Path(turns, dR, H0, B, q, scale)
+    cost = path.cost
 
     def jacobian(X: Array) -> Array:
         # asked for at the start and once at every accepted iterate: the only hook in all SciPy versions
-        if not np.array_equal(X, path[-1]):
-            path.append(np.array(X))
+        path.keep(X)
         return cost.differences(X) if numerical else cost.jacobian(X)
 
     found = least_squares(
-        cost.residuals, start.ravel(), jac=jacobian, method="trf", max_nfev=n_iter, xtol=1e-12, ftol=1e-14, gtol=1e-14
+        cost.residuals,
+        path.start,
+        jac=jacobian,  # type: ignore[arg-type]
+        method="trf",
+        max_nfev=n_iter,
+        xtol=1e-12,
+        ftol=1e-14,
+        gtol=1e-14,
     )
-    path.append(np.array(found.x))
-    return _baseline(batch, known, path, B, "trust-region", cost, raw_unit)
-
-
-def _baseline(
-    batch: TurnBatch, q: Array, path: list[Array], B: ArrayLike | None, method: str, cost: _Cost, raw_unit: str
-) -> Fit:
-    if len(path) == 1:
-        path = path * 2
-    history = np.stack(path).reshape(-1, 3, 3)
-    fit = _fit(batch, q, history, B, method, raw_unit)
-    fit.history["evaluations"] = np.array(cost.evaluations)  # type: ignore[index]
-    return fit
+    path.keep(found.x)
+    return path.fit("trust-region", raw_unit)

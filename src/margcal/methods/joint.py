@@ -33,7 +33,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.types import Array, Kind
-from margcal.methods.preintegration import TurnBatch, preintegrate
+from margcal.methods.preintegration import TurnBatch, integrate, preintegrate
 
 ANGLE_ERROR = 2e-4
 """Error of an integrated turn beside the white noise, as a fraction of the angle turned (g-sensitivity,
@@ -41,6 +41,8 @@ nonlinearity, sampling); the variance component scales it to what the data show.
 FIRST_S_ROT = np.radians(0.3)
 """Start of the attitude error s_rot, rad, before it is estimated."""
 MIN_S_ROT = np.radians(0.005)
+COMPONENT_TOL = 1e-3
+"""Relative change of a variance component that no longer matters: its own standard error is above 5 %."""
 MIN_REDUNDANCY = 3.0
 """A variance component with less redundancy than this is not estimated."""
 
@@ -136,9 +138,15 @@ class _Layout:
     B: dict[Kind, slice]
     u: dict[Kind, slice]
     R: Array  # (J, 3) columns
-    mask: dict[Kind, Array] = field(
-        default_factory=dict
-    )  # entries of A (or of the gyroscope's H) that are free
+    mask: dict[Kind, Array] = field(default_factory=dict)  # entries of A (or of the gyroscope's H) that are free
+
+
+@dataclass(frozen=True)
+class _Data:
+    triads: Mapping[Kind, Triad]
+    gyro: Gyro | None
+    priors: Priors
+    layout: _Layout
 
 
 @dataclass(frozen=True)
@@ -160,7 +168,7 @@ def joint_fit(
     components: Mapping[str, float] | None = None,
     estimate_components: bool = True,
     max_iter: int = 60,
-    tol: float = 1e-8,
+    tol: float = 1e-4,
 ) -> JointFit:
     """Maximum-likelihood fit of all sensors and attitudes.
 
@@ -179,38 +187,37 @@ def joint_fit(
     max_iter : int
     tol : float
         Converged when no unknown moves by more than this many of its standard deviations and no component by
-        more than 1e-4 of itself.
+        more than `COMPONENT_TOL` of itself.
 
     Returns
     -------
     JointFit
     """
-    layout = _lay_out(triads, gyro, len(R), priors)
-    state = _start(triads, gyro, R)
+    layout = _lay_out(triads, gyro, len(R))
+    data = _Data(triads, gyro, priors, layout)
     scale = dict(components or {})
-    # gauge and otherwise undetermined directions are held by this weak pull to the start
+    if priors.s_rot is not None:
+        scale["rot"] = priors.s_rot
+    state = _start(triads, gyro, R)
+    blocks = _blocks(data, state)
     converged, n_iter = False, 0
-    blocks = _blocks(triads, gyro, priors, layout, state)
-    for n_iter in range(1, max_iter + 1):
+    while not converged and n_iter < max_iter:
+        n_iter += 1
         N, g, parts = _normal(blocks, scale, layout.size)
         inverse = _inverse(N)
-        step = inverse @ g
-        state, moved = _damped(triads, gyro, priors, layout, state, scale, step)
-        blocks = _blocks(triads, gyro, priors, layout, state)
-        relative = np.max(np.abs(moved) / np.sqrt(np.maximum(np.diag(inverse), 1e-300)), initial=0.0)
+        state, blocks, step = _damped(data, state, blocks, scale, inverse @ g)
+        moved = np.max(np.abs(step) / np.sqrt(np.maximum(np.diag(inverse), 1e-300)), initial=0.0)
         changed = 0.0
-        if estimate_components and relative < 1.0:
+        if estimate_components and moved < 1.0:
             scale, changed = _update_components(blocks, scale, inverse, parts, priors)
-        if relative < tol**0.5 and changed < 1e-4:
-            converged = True
-            break
-    return _result(triads, gyro, layout, state, blocks, scale, priors, n_iter, converged)
+        converged = bool(moved < tol and changed < COMPONENT_TOL)
+    return _result(data, state, blocks, scale, n_iter, converged)
 
 
 # --- unknowns ----------------------------------------------------------------------------------------
 
 
-def _lay_out(triads: Mapping[Kind, Triad], gyro: Gyro | None, n_rests: int, priors: Priors) -> _Layout:
+def _lay_out(triads: Mapping[Kind, Triad], gyro: Gyro | None, n_rests: int) -> _Layout:
     at = 0
     A: dict[Kind, slice] = {}
     B: dict[Kind, slice] = {}
@@ -258,16 +265,17 @@ def _tangent(u: Array) -> Array:
 # --- residuals ---------------------------------------------------------------------------------------
 
 
-def _blocks(
-    triads: Mapping[Kind, Triad], gyro: Gyro | None, priors: Priors, layout: _Layout, state: _State
-) -> list[_Block]:
+def _blocks(data: _Data, state: _State) -> list[_Block]:
+    triads, gyro, priors, layout = data.triads, data.gyro, data.priors, data.layout
     blocks = [_triad_block(kind, triad, layout, state) for kind, triad in triads.items()]
     if gyro is not None:
-        blocks += [_gyro_rest_block(gyro, layout, state), _turn_block(gyro, layout, state)]
+        blocks.append(_gyro_rest_block(gyro, layout, state))
+        if len(gyro.turns):
+            blocks.append(_turn_block(gyro, layout, state))
     if priors.R0 is not None:
         blocks.append(_attitude_block(priors.R0, layout, state))
     if priors.up is not None:
-        blocks.append(_level_block(priors, layout, state))
+        blocks.append(_level_block(priors.up, priors.level_sd, layout, state))
     if priors.vertical_sd is not None and "acc" in layout.u:
         blocks.append(_vertical_block(priors.vertical_sd, layout, state))
     return [b for b in blocks if len(b.r)]
@@ -335,14 +343,13 @@ def _attitude_block(R0: Array, layout: _Layout, state: _State) -> _Block:
     return _Block("rot", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 3))
 
 
-def _level_block(priors: Priors, layout: _Layout, state: _State) -> _Block:
+def _level_block(up: Array, level_sd: float, layout: _Layout, state: _State) -> _Block:
     """(v): components of R^T z across the housing direction that is up, over level_sd."""
-    assert priors.up is not None
     v = state.R[:, 2, :]  # R^T z
-    across = np.stack([_tangent(c).T for c in priors.up])  # (J, 2, 3)
-    r = np.einsum("jkc,jc->jk", across, v) / priors.level_sd
+    across = np.stack([_tangent(c).T for c in up])  # (J, 2, 3)
+    r = np.einsum("jkc,jc->jk", across, v) / level_sd
     J = np.zeros((len(r), 2, layout.size))
-    _put(J, layout.R, across @ so3.skew(v) / priors.level_sd)
+    _put(J, layout.R, across @ so3.skew(v) / level_sd)
     return _Block("level", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 2))
 
 
@@ -368,9 +375,7 @@ def _sigma(name: str, scale: Mapping[str, float]) -> float:
     return scale.get(name, FIRST_S_ROT if name == "rot" else 1.0)
 
 
-def _normal(
-    blocks: Sequence[_Block], scale: Mapping[str, float], size: int
-) -> tuple[Array, Array, dict[str, Array]]:
+def _normal(blocks: Sequence[_Block], scale: Mapping[str, float], size: int) -> tuple[Array, Array, dict[str, Array]]:
     parts = {b.name: b.J.T @ b.J / _sigma(b.name, scale) ** 2 for b in blocks}
     g = np.zeros(size)
     for b in blocks:
@@ -392,22 +397,17 @@ def _cost(blocks: Sequence[_Block], scale: Mapping[str, float]) -> float:
 
 
 def _damped(
-    triads: Mapping[Kind, Triad],
-    gyro: Gyro | None,
-    priors: Priors,
-    layout: _Layout,
-    state: _State,
-    scale: Mapping[str, float],
-    step: Array,
-) -> tuple[_State, Array]:
+    data: _Data, state: _State, blocks: list[_Block], scale: Mapping[str, float], step: Array
+) -> tuple[_State, list[_Block], Array]:
     """The full step, halved while it raises the cost."""
-    before = _cost(_blocks(triads, gyro, priors, layout, state), scale)
+    before = _cost(blocks, scale)
     for _ in range(8):
-        trial = _moved(layout, state, step)
-        if _cost(_blocks(triads, gyro, priors, layout, trial), scale) <= before * (1 + 1e-9) + 1e-12:
-            return trial, step
+        trial = _moved(data.layout, state, step)
+        after = _blocks(data, trial)
+        if _cost(after, scale) <= before * (1 + 1e-9) + 1e-12:
+            return trial, after, step
         step = step / 2
-    return state, np.zeros_like(step)
+    return state, blocks, np.zeros_like(step)
 
 
 def _update_components(
@@ -419,11 +419,9 @@ def _update_components(
 ) -> tuple[dict[str, float], float]:
     """sigma^2 <- v^T P v / redundancy for every component that the data can tell."""
     new, changed = dict(scale), 0.0
+    fixed = {"level", "vertical"} | ({"rot"} if priors.s_rot is not None else set())
     for b in blocks:
-        fixed = b.name in ("level", "vertical") or (b.name == "rot" and priors.s_rot is not None)
-        if fixed:
-            if b.name == "rot" and priors.s_rot is not None:
-                new["rot"] = priors.s_rot
+        if b.name in fixed:
             continue
         redundancy = _redundancy(b, inverse, parts)
         if redundancy < MIN_REDUNDANCY:
@@ -444,16 +442,9 @@ def _redundancy(block: _Block, inverse: Array, parts: Mapping[str, Array]) -> fl
 
 
 def _result(
-    triads: Mapping[Kind, Triad],
-    gyro: Gyro | None,
-    layout: _Layout,
-    state: _State,
-    blocks: Sequence[_Block],
-    scale: dict[str, float],
-    priors: Priors,
-    n_iter: int,
-    converged: bool,
+    data: _Data, state: _State, blocks: list[_Block], scale: dict[str, float], n_iter: int, converged: bool
 ) -> JointFit:
+    triads, gyro, layout = data.triads, data.gyro, data.layout
     N, _, parts = _normal(blocks, scale, layout.size)
     inverse = _inverse(N)
     H: dict[Kind, Array] = {}
@@ -468,9 +459,9 @@ def _result(
     if gyro is not None:
         H["gyr"] = state.A["gyr"]
         covariance["gyr"] = _model_covariance(layout, inverse, "gyr", H["gyr"], forward=False)
-        pre = preintegrate(gyro.turns.y, gyro.turns.dt, H["gyr"], state.B["gyr"])
+        dR = integrate(gyro.turns.y, gyro.turns.dt, H["gyr"], state.B["gyr"])
         net = np.swapaxes(state.R[gyro.before], -1, -2) @ state.R[gyro.after]
-        residual["gyr"] = so3.angle_between(pre.dR, net)
+        residual["gyr"] = so3.angle_between(dR, net)
     redundancy = {b.name: _redundancy(b, inverse, parts) for b in blocks}
     return JointFit(
         H=H,
@@ -482,7 +473,7 @@ def _result(
         redundancy=redundancy,
         residual=residual,
         standardized={b.name: _standardized(b, scale, inverse) for b in blocks},
-        s_rot=_sigma("rot", scale) if priors.R0 is not None else None,
+        s_rot=_sigma("rot", scale) if data.priors.R0 is not None else None,
         cost=_cost(blocks, scale),
         dof=float(sum(redundancy.values())),
         n_iter=n_iter,

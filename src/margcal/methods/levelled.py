@@ -135,9 +135,7 @@ def _refuse_missing_faces(kind: str, up: Array) -> None:
     found = distinct_directions(up, B=np.zeros(3))
     if found >= MIN_RESTS:
         return
-    faces = {
-        f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("+", 1), ("-", -1))
-    }
+    faces = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("+", 1), ("-", -1))}
     missing = [name for name, face in faces.items() if (up @ face).max() < math.cos(math.radians(15))]
     advice = f"no rest has {', '.join(missing)} up: put the housing down on these faces too"
     raise too_few(kind, found, MIN_RESTS, "distinct directions of up", advice)

@@ -141,9 +141,7 @@ def _mean_readings(y: Array, w: Array | None) -> Array:
 def _mean_rotations(R: Array, w: Array | None) -> Array:
     if w is None:
         return R.mean(axis=-3)
-    return (
-        np.einsum("...j,...jik->...ik", w, np.broadcast_to(R, (*w.shape[:-1], *R.shape[-3:]))) / R.shape[-3]
-    )
+    return np.einsum("...j,...jik->...ik", w, np.broadcast_to(R, (*w.shape[:-1], *R.shape[-3:]))) / R.shape[-3]
 
 
 def _uncertainty(

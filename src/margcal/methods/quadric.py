@@ -131,7 +131,7 @@ def _adjusted_matrices(moments: Array) -> Array:
 
 
 def ellipsoid_of(theta: Array) -> tuple[Array, Array, Array]:
-    """K, b and whether the quadric theta (..., 10) is a real ellipsoid; where it is not, K and b mean nothing."""
+    """K, b and whether the quadric theta (..., 10) is a real ellipsoid; else K and b mean nothing."""
     S = np.empty((*theta.shape[:-1], 3, 3))
     for row, (p, q) in enumerate(PAIRS):
         S[..., p, q] = S[..., q, p] = theta[..., row] * (1.0 if p == q else 0.5)
@@ -263,15 +263,13 @@ def why_not(z: Array) -> str:
     normal = Vt[2]
     if thickness < 0.15:
         axis = axis_words(normal)
-        return f"the readings lie near a plane across {axis}: tilt that axis towards the sensed vector, up and down"
+        return f"the readings lie near a plane across {axis}: tilt it towards the sensed vector, up and down"
     _, b = sphere(z)
     directions = (z - b) / np.linalg.norm(z - b, axis=1, keepdims=True)
     mean = directions.mean(axis=0)
     if np.linalg.norm(mean) > 0.4:
         return f"the readings cover one side only: none have {axis_words(-mean)} towards the sensed vector"
-    return (
-        "the readings do not lie on an ellipsoid: look for a disturbance, or record more attitudes all around"
-    )
+    return "the readings do not lie on an ellipsoid: look for a disturbance, or record more attitudes all around"
 
 
 def axis_words(direction: Array) -> str:

@@ -174,9 +174,7 @@ def split(H: ArrayLike, B: ArrayLike, *, soft_iron: bool = False) -> ErrorParame
         R, sign = _proper(R)
         # the sign sits between R and A_si: R diag(sign) is the orthogonal factor again
         phi, theta, psi = mounting_angles(R)
-        return ErrorParameters(
-            scale=size * sign, phi=phi, theta=theta, psi=psi, soft_iron=shape / size, hard_iron=B
-        )
+        return ErrorParameters(scale=size * sign, phi=phi, theta=theta, psi=psi, soft_iron=shape / size, hard_iron=B)
     R, L = _ql(H)
     R, sign = _proper(R)
     L = sign[:, None] * L
@@ -297,9 +295,7 @@ def describe(model: SensorModel) -> Description:
         mounting_angle_deg=math.degrees(float(np.linalg.norm(so3.log(rest)))),
         mirrored=bool(np.linalg.det(H) < 0),
         hard_iron=tuple((model.B / scale).tolist()) if magnetic else None,
-        soft_iron=tuple(map(tuple, split(H, model.B, soft_iron=True).soft_iron.tolist()))
-        if magnetic
-        else None,
+        soft_iron=tuple(map(tuple, split(H, model.B, soft_iron=True).soft_iron.tolist())) if magnetic else None,
     )
 
 

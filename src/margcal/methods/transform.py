@@ -56,9 +56,7 @@ def two_step_bias(y: Array, magnitude: float, kind: Kind, bias: ArrayLike | None
     return np.broadcast_to(B, (*y.shape[:-2], 3))
 
 
-def _fit(
-    name: As, y: Array, R: Array, H: Array, B: Array, u: Array, method: str, cites: str, **more: object
-) -> Fit:
+def _fit(name: As, y: Array, R: Array, H: Array, B: Array, u: Array, method: str, cites: str, **more: object) -> Fit:
     """The `Fit` of a two-step method: residual norms of (25) and their sum of squares."""
     residual = np.linalg.norm(pose_residual(y, R, H, B, u), axis=-1)
     model = model_of(name, H, B, method, residual)
@@ -116,9 +114,7 @@ def alternation(
     Y = np.swapaxes(y - B[..., None, :], -1, -2)  # (27)
     stacked = R.reshape(*R.shape[:-3], -1, 3)  # (28)
     Y_pinv, R_pinv = np.linalg.pinv(Y), np.linalg.pinv(stacked)
-    u = np.array(
-        np.broadcast_to(np.ones(3) if u0 is None else np.asarray(u0, dtype=np.float64), (*y.shape[:-2], 3))
-    )
+    u = np.array(np.broadcast_to(np.ones(3) if u0 is None else np.asarray(u0, dtype=np.float64), (*y.shape[:-2], 3)))
     H = np.zeros((*y.shape[:-2], 3, 3))
     turned = np.full(y.shape[:-2], np.inf)
     all_H, all_u = [], []

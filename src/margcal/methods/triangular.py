@@ -1,4 +1,4 @@
-"""Bias and scale (and non-orthogonality) in the sensor's own frame, from the length of the sensed vector alone.
+"""Bias, scale and non-orthogonality in the sensor's own frame, from the length of the sensed vector alone.
 
 [5] I. Skog, P. Haendel, "Calibration of a MEMS inertial measurement unit", XVII IMEKO World Congress, 2006.
     The "sensor frame only" baseline of Z-TIE's Table III.

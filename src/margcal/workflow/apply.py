@@ -165,9 +165,7 @@ def _job(calibration: Calibration, path: Path, units: dict[str, str] | None, for
             "remove or rename those"
         )
     if job.delays and columns.t is None:
-        raise InputError(
-            f"{table.file}: no column t_s, which correcting a delay needs; name the time in seconds t_s"
-        )
+        raise InputError(f"{table.file}: no column t_s, which correcting a delay needs; name the time in seconds t_s")
     return job
 
 
@@ -229,9 +227,7 @@ def _write(job: _Job, path: Path, summary: dict[str, Any], progress: Progress | 
             summary["forced"].append(f"{kind}: {sensor.columns.unit} taken as {sensor.model.raw_unit}")
 
 
-def _write_once(
-    job: _Job, path: Path, take: dict[int, As], progress: Progress | None
-) -> tuple[int, float | None]:
+def _write_once(job: _Job, path: Path, take: dict[int, As], progress: Progress | None) -> tuple[int, float | None]:
     """(rows, recorded seconds) of one pass over the table."""
     import pyarrow as pa
 
@@ -264,9 +260,7 @@ def _span(ends: list[Any]) -> float | None:
         return None
 
 
-def _output(
-    job: _Job, batch: pa.RecordBatch, vectors: Mapping[Kind, Array], *, nan_is_null: bool
-) -> pa.RecordBatch:
+def _output(job: _Job, batch: pa.RecordBatch, vectors: Mapping[Kind, Array], *, nan_is_null: bool) -> pa.RecordBatch:
     """`batch` with the calibrated columns in place of the raw ones."""
     import pyarrow as pa
 

@@ -248,7 +248,9 @@ def _file_index(recordings: Sequence[Recording], table: PoseTable) -> list[int]:
     out = []
     for j, name in enumerate(table.file):
         if Path(name).name not in names:
-            raise InputError(f"poses table, row {j + 1}: no recording is called {name!r} (there are {', '.join(names)})")
+            raise InputError(
+                f"poses table, row {j + 1}: no recording is called {name!r} (there are {', '.join(names)})"
+            )
         out.append(names.index(Path(name).name))
     return out
 
@@ -652,11 +654,9 @@ def _settings(
         "method": [options.pose_method, options.gyro_method],
         "gravity": options.gravity,
         "field_uT": options.field_uT,
-        "at": None if place is None else [place.latitude_deg, place.longitude_deg, str(place.date)],
+        "at": None if place is None else [place.latitude_deg, place.longitude_deg, place.field.year],
         "level": level,
         "level_sd_deg": float(np.degrees(options.level_sd)),
         "units": {k: u for r in recordings for k, u in r.units.items()},
         "sources": dict(solved.sources),
     }
-
-

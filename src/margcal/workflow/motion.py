@@ -134,9 +134,7 @@ class RestsAndTurns:
         s, ds, _ = minimum_jerk(x)
         b, db, ddb = bump(x)
         R = self.R[j] @ so3.exp(s[:, None] * net[j])
-        R, rate = _wobbled(
-            R, ds[:, None] / T * net[j], b[:, None] * self.detour[j], db[:, None] / T * self.detour[j]
-        )
+        R, rate = _wobbled(R, ds[:, None] / T * net[j], b[:, None] * self.detour[j], db[:, None] / T * self.detour[j])
         return R, rate, ddb[:, None] / T**2 * self.lift[j]
 
 

@@ -175,9 +175,7 @@ def parse_at(text: str) -> Place:
     try:
         latitude, longitude = float(parts[0]), float(parts[1])
     except ValueError:
-        raise UsageError(
-            f"--at {text!r}: latitude and longitude are degrees as numbers, such as 51.5,-0.12"
-        ) from None
+        raise UsageError(f"--at {text!r}: latitude and longitude are degrees as numbers, such as 51.5,-0.12") from None
     try:
         _in_range("latitude", latitude, -90, 90)
         _in_range("longitude", longitude, -180, 180)

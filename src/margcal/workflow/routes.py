@@ -180,9 +180,7 @@ def _acc_known(job: Job, R: Array, usable: Array) -> Fit:
 def _level(job: Job, up: Array) -> Fit:
     y, index = job.readings("acc")
     keep = np.isfinite(up[index]).all(axis=1)
-    return level_prior(
-        y[keep], up[index[keep]], job.options.gravity, job.options.level_sd, **job.as_named("acc")
-    )
+    return level_prior(y[keep], up[index[keep]], job.options.gravity, job.options.level_sd, **job.as_named("acc"))
 
 
 def _gyr_known(job: Job, R: Array, usable: Array, solved: Solved) -> Fit:
@@ -244,9 +242,7 @@ def _gyro_rest(job: Job) -> tuple[Array, Array, Array]:
     poses = job.segmentation.poses
     y, index = job.readings("gyr")
     if not len(y):
-        text = (
-            "gyroscope: no rest, so its bias is unknown; leave the node still for some seconds at the start"
-        )
+        text = "gyroscope: no rest, so its bias is unknown; leave the node still for some seconds at the start"
         raise DataError(text, (Issue("no-rest", "fail", text, "gyr"),))
     sd = np.sqrt(np.nanmean(poses.sd["gyr"][index] ** 2, axis=0))
     sd = np.maximum(sd, 1e-9 * np.abs(y).max() + 1e-12)
@@ -272,13 +268,10 @@ def _without_full_turns(
     if not len(found.index) or len(rest) < MIN_TURNS:
         return fit
     again = refit(rest)
-    found = full_turns(
-        [turns[i] for i in found.index], again.model.H, again.model.B, low_deg=300, high_deg=420
-    )
+    found = full_turns([turns[i] for i in found.index], again.model.H, again.model.B, low_deg=300, high_deg=420)
     angles = ", ".join(f"{a:.1f}" for a in found.angle_deg)
     text = (
-        f"gyroscope: {len(found.index)} full turns were kept out of the fit; calibrated they close at "
-        f"{angles} degrees"
+        f"gyroscope: {len(found.index)} full turns were kept out of the fit; calibrated they close at {angles} degrees"
     )
     worst = float(np.max(np.abs(found.angle_deg - 360.0), initial=0.0))
     solved.issues.append(Issue("full-turns", "note", text, "gyr", worst))
@@ -463,9 +456,7 @@ def _turned_to_field(job: Job, fit: Fit, R: Array, piece: Array) -> Array:
     return out
 
 
-def _refined(
-    job: Job, solved: Solved, R: Array, turns: list[Turn], priors: Priors, *, triangular: bool
-) -> Solved:
+def _refined(job: Job, solved: Solved, R: Array, turns: list[Turn], priors: Priors, *, triangular: bool) -> Solved:
     """One joint refinement of all sensors and attitudes; where the accelerometer stands alone there is nothing
     to share."""
     solved.R = R
@@ -607,9 +598,7 @@ def _aligned(job: Job, solved: Solved, recording: Recording, fit: Fit) -> None:
     found = rotation_from_rates(mag.t[good], v, gyr.t, rate)
     H = found.Omega @ fit.model.H
     covariance = _turned_covariance(fit.covariance, found.Omega, found.se_deg, H)
-    solved.fits["mag"] = replace(
-        fit, model=replace(fit.model, H=H, covariance=covariance), covariance=covariance
-    )
+    solved.fits["mag"] = replace(fit, model=replace(fit.model, H=H, covariance=covariance), covariance=covariance)
     if found.delay_s is not None:
         solved.delays["mag"] = (found.delay_s, found.delay_se_s)
     angles = np.degrees(so3.log(found.Omega))

@@ -216,9 +216,7 @@ def _rests_at(recording: Recording, floors: Floors, ratio: float) -> list[_Rest]
     return [r for r in rests if not _drifts(recording, floors, ratio, r)]
 
 
-def _join_knocked(
-    recording: Recording, floors: Floors, stretches: Sequence[tuple[float, float]]
-) -> list[_Rest]:
+def _join_knocked(recording: Recording, floors: Floors, stretches: Sequence[tuple[float, float]]) -> list[_Rest]:
     """Join neighbouring stretches of one attitude that a short disturbance separates."""
     spread = _spread(recording, stretches)
     rests: list[_Rest] = []

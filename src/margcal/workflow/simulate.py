@@ -176,9 +176,7 @@ def simulate(
     _check(n_poses, poses, seconds, sensors, disturbed, wrong_label)
     pose_rng, motion_rng, noise_rng, knock_rng, other_rng = np.random.default_rng([seed, 1]).spawn(5)
     up, north = _vectors(place, gravity, dip_deg, field_uT)
-    errors = NodeErrors(
-        scale_error, non_orthogonality_deg, mounting_deg, soft_iron, hard_iron_uT, _mag_axes(mag_axes)
-    )
+    errors = NodeErrors(scale_error, non_orthogonality_deg, mounting_deg, soft_iron, hard_iron_uT, _mag_axes(mag_axes))
     label = attitudes(poses, n_poses, pose_rng)
     R_nh = put_down(label, housing_sd_deg, level_sd_deg, pose_rng)
     start = np.arange(n_poses, dtype=np.float64) * (rest_s + turn_s)
@@ -196,9 +194,7 @@ def simulate(
     magnetic = Field(north)
     if disturbed is not None:
         size = disturbance * float(np.linalg.norm(north))
-        magnetic = Field(
-            north, size * random_directions(other_rng, 1)[0], start[disturbed], stop[disturbed], turn_s
-        )
+        magnetic = Field(north, size * random_directions(other_rng, 1)[0], start[disturbed], stop[disturbed], turn_s)
     if wrong_label is not None:
         label[wrong_label] = label[wrong_label] @ _QUARTER_TURN
     clocks = _clocks(stop[-1], rate, separate_clocks)
@@ -245,9 +241,7 @@ def swing(
     _check(1, "free", {"rate": rate, "duration_s": duration_s}, sensors)
     motion_rng, noise_rng = np.random.default_rng([seed, 2]).spawn(2)
     up, north = _vectors(place, gravity, dip_deg, field_uT)
-    errors = NodeErrors(
-        scale_error, non_orthogonality_deg, mounting_deg, soft_iron, hard_iron_uT, _mag_axes(mag_axes)
-    )
+    errors = NodeErrors(scale_error, non_orthogonality_deg, mounting_deg, soft_iron, hard_iron_uT, _mag_axes(mag_axes))
     truth = true_calibration(
         errors,
         {"acc": up, "mag": north},
@@ -267,9 +261,7 @@ def swing(
     return Simulation(recording, truth, none, none, np.zeros(0), np.zeros(0), np.zeros((0, 2)), motion)
 
 
-def write_simulation(
-    simulation: Simulation, folder: str | Path, *, overwrite: bool = False
-) -> tuple[Path, Path, Path]:
+def write_simulation(simulation: Simulation, folder: str | Path, *, overwrite: bool = False) -> tuple[Path, Path, Path]:
     """Write session.parquet (or a folder `session`, a table a clock), poses.csv and truth.json into `folder`.
 
     Returns

@@ -64,9 +64,7 @@ class Field:
     fade: float = 1.0
 
     def at(self, t: Array) -> Array:
-        there = (
-            minimum_jerk((t - self.start) / self.fade + 1)[0] - minimum_jerk((t - self.stop) / self.fade)[0]
-        )
+        there = minimum_jerk((t - self.start) / self.fade + 1)[0] - minimum_jerk((t - self.stop) / self.fade)[0]
         return self.vector + there[:, None] * self.extra
 
 
@@ -112,9 +110,7 @@ def true_calibration(
                 delay_s=delay,
                 temperature_degC=temperature_degC,
             )
-    return Calibration(
-        models.get("acc"), models.get("gyr"), models.get("mag"), f"simulated-{seed}", frame="housing"
-    )
+    return Calibration(models.get("acc"), models.get("gyr"), models.get("mag"), f"simulated-{seed}", frame="housing")
 
 
 def readings(
@@ -166,9 +162,7 @@ def _sensed(kind: Kind, state: State, t: Array, up: Array, magnetic: Field) -> A
     return np.einsum("nji,nj->ni", state.R, in_n)  # R_nh^T v_n
 
 
-def reference_track(
-    motion: Motion, t: Array, noise_deg: float, gaps: int, rng: np.random.Generator
-) -> Reference:
+def reference_track(motion: Motion, t: Array, noise_deg: float, gaps: int, rng: np.random.Generator) -> Reference:
     """The housing's attitude as motion capture would give it; NaN in `gaps` gaps of 0.3 to 1.5 s."""
     R = motion.at(t).R @ so3.exp(math.radians(noise_deg) * rng.normal(size=(len(t), 3)))
     q = so3.quat_from_matrix(R)
