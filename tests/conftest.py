@@ -15,9 +15,7 @@ def find_data(name: str) -> Path:
     """Path of a real recording such as ``imu_tk/xsens_mti_multipose.parquet``; the test is skipped without it."""
     path = Path(os.environ.get("MARGCAL_DATA", _DEFAULT)).resolve() / name
     if not path.exists():
-        pytest.skip(
-            f"real recording {name} is not here: set MARGCAL_DATA to the folder that holds it ({path})"
-        )
+        pytest.skip(f"real recording {name} is not here: set MARGCAL_DATA to the folder that holds it ({path})")
     return path
 
 

@@ -80,7 +80,7 @@ def correct(x: Array, P: Array, z: Array, H: Array, R: Array) -> Correction:
     """Linear correction by ``z = H x + w``, w of covariance R; Joseph's form keeps P positive definite."""
     innovation = z - _times(H, x)
     S = _symmetric(H @ P @ _T(H) + R)
-    K = np.swapaxes(np.linalg.solve(S, H @ P), -1, -2)
+    K = _T(np.asarray(np.linalg.solve(S, H @ P), dtype=np.float64))
     rest = np.eye(x.shape[-1]) - K @ H
     return Correction(x + _times(K, innovation), _symmetric(rest @ P @ _T(rest) + K @ R @ _T(K)), innovation, S)
 
@@ -127,6 +127,6 @@ def unscented_correct(
     points = sigma_points(x, P, sigma)
     mean, cov, cross = unscented_mean_cov(points, h(points), sigma)
     S = _symmetric(cov + R)
-    K = np.swapaxes(np.linalg.solve(S, _T(cross)), -1, -2)
+    K = _T(np.asarray(np.linalg.solve(S, _T(cross)), dtype=np.float64))
     innovation = z - mean
     return Correction(x + _times(K, innovation), _symmetric(P - K @ S @ _T(K)), innovation, S)

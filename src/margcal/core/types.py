@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from margcal.core.errors import InputError
-from margcal.core.units import KINDS, SI_UNIT
+from margcal.core.units import KINDS, SI_UNIT, Kind
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
-Kind = Literal["acc", "gyr", "mag"]
 Level = Literal["note", "warn", "fail"]
 Verdict = Literal["pass", "warn", "fail"]
 

@@ -8,11 +8,13 @@ sensor kinds that may carry it and the factor to the SI unit of `SI_UNIT`. A fac
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 STANDARD_GRAVITY = 9.80665
 """One standard gravity, m/s^2 (exact by definition), the default of ``--gravity``."""
 
-KINDS = ("acc", "gyr", "mag")
+Kind = Literal["acc", "gyr", "mag"]
+KINDS: tuple[Kind, ...] = ("acc", "gyr", "mag")
 """The sensors of a node in the order in which they are always listed."""
 
 SI_UNIT = {"acc": "m/s^2", "gyr": "rad/s", "mag": "uT"}

@@ -294,10 +294,12 @@ def numbers(array: pa.Array) -> Array:
     return values.astype(np.float64, copy=False)
 
 
-def nan_to_null(array: pa.Array) -> pa.Array:
-    """A floating array with null (an empty cell in CSV) for NaN; any other array as it is."""
+def cells(array: pa.Array) -> pa.Array:
+    """A column as CSV can hold it: null (an empty cell) for NaN, categories spelled out."""
     import pyarrow as pa
 
+    if isinstance(array, pa.DictionaryArray):
+        return array.dictionary_decode()
     plain = {"double": "f8", "float": "f4"}.get(str(array.type))
     if plain is None or array.null_count or (data := array.buffers()[1]) is None:
         return array

@@ -42,10 +42,11 @@ def structs() -> Any:
 
     vector = tuple[float, float, float]
     matrix = tuple[vector, vector, vector]
-    row12 = Annotated[list[float], Meta(min_length=12, max_length=12)]
-    matrix12 = Annotated[list[row12], Meta(min_length=12, max_length=12)]
+    row12: Any = Annotated[list[float], Meta(min_length=12, max_length=12)]
+    matrix12: Any = Annotated[list[row12], Meta(min_length=12, max_length=12)]
     quaternion = tuple[float, float, float, float]
-    positive = Annotated[float, Meta(ge=0)]
+    positive: Any = Annotated[float, Meta(ge=0)]
+    count: Any = Annotated[int, Meta(ge=0)]
 
     def sensor(name: str, unit: Any) -> Any:
         return struct(
@@ -57,7 +58,7 @@ def structs() -> Any:
                 ("unit", unit),
                 ("covariance", matrix12 | None, None),
                 ("residual_rms", positive | None, None),
-                ("n_poses", Annotated[int, Meta(ge=0)] | None, None),
+                ("n_poses", count | None, None),
                 ("method", str, ""),
                 ("reference_vector", vector | None, None),
                 ("expected_error_deg", positive | None, None),

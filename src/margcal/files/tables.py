@@ -235,12 +235,13 @@ def _sampled(kind: Kind, t: Array, y: Array, unit: str, file: str) -> tuple[Stre
         y.flags.writeable = False
         return Stream(kind, t, y, unit), []
     blank = np.isnan(y)
-    valid = ~blank.any(axis=1)
+    empty = np.asarray(blank.all(axis=1))
+    valid = ~np.asarray(blank.any(axis=1))
     if not valid.any():
         text = f"{file}: every row of {kind} is empty; taken as a recording without {kind}"
         return None, [Issue("sensor-empty", "warn", text, sensor=kind)]
-    partial = int((~valid & ~blank.all(axis=1)).sum())
-    lost = _lost_rows(t, valid, blank.all(axis=1))
+    partial = int((~valid & ~empty).sum())
+    lost = _lost_rows(t, valid, empty)
     count = lost + partial
     stream = Stream(kind, t[valid], y[valid], unit)
     if not count:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+import numpy as np
+
 from margcal.core.checking import printable
 from margcal.core.errors import InputError
 
@@ -154,7 +156,7 @@ class TextLines(io.RawIOBase):
                 raise InputError(
                     f"{self.name}: line {line}: a NUL byte; the file is damaged (or binary): remove the line"
                 )
-            if b"#" in block or b"//" in block or b'"' in block or self.drop:
+            if b"#" in block or b"//" in block or self.drop or _quote_left_open(block):
                 clean = self._clean_lines(block)
             else:
                 clean = block
@@ -181,6 +183,15 @@ class TextLines(io.RawIOBase):
                 )
             kept.append(line)
         return b"".join(kept)
+
+
+def _quote_left_open(block: bytes) -> bool:
+    """Whether some line of `block` holds an odd number of quotes."""
+    if b'"' not in block:
+        return False
+    data = np.frombuffer(block, dtype=np.uint8)
+    before_end = np.searchsorted(np.flatnonzero(data == ord('"')), np.flatnonzero(data == ord("\n")))
+    return bool((before_end % 2).any()) or bool(block.count(b'"') % 2)
 
 
 def _is_comment(line: bytes) -> bool:
@@ -259,13 +270,13 @@ def sniff(path: Path) -> Dialect:
     header, header_rows = rows[0], 1
     delimiter = max(";\t,", key=lambda d: _outside_quotes(header).count(d))
     if all(_is_number(f) for f in _split(header, delimiter)):
-        header = _commented_header(comments, len(_split(header, delimiter)), delimiter)
-        if header is None:
+        found = _commented_header(comments, len(_split(header, delimiter)), delimiter)
+        if found is None:
             raise InputError(
                 f"{name}: the first row holds numbers, not column names; put a row such as "
                 "t_s,acc_x_count,acc_y_count,acc_z_count at the top"
             )
-        header_rows = 0
+        header, header_rows = found, 0
     names = tuple(f.strip() for f in _split(header, delimiter))
     if len(rows) == header_rows:
         raise InputError(f"{name}: holds a header and no rows; record or export it again")

@@ -98,10 +98,10 @@ def table_writer(path: Path, schema: pa.Schema) -> Iterator[Write]:
     if name.endswith(".gz"):
         import gzip
 
-        file: Any = gzip.GzipFile(path, "wb", compresslevel=6, mtime=0)
+        opened: Any = gzip.GzipFile(path, "wb", compresslevel=6, mtime=0)
     else:
-        file = open(path, "wb")
-    with file:
+        opened = path.open("wb")
+    with opened as file:
         file.write((delimiter.join(_quoted(n, delimiter) for n in schema.names) + "\n").encode())
         yield lambda batch: _write_csv(batch, file, delimiter)
 
@@ -130,27 +130,40 @@ def _parquet_writer(path: Path, schema: pa.Schema) -> Iterator[Write]:
 
 
 def _write_csv(batch: pa.RecordBatch, file: Any, delimiter: str) -> None:
-    """Append rows; text is quoted only in batches that need it (pyarrow quotes all text or none)."""
+    """Append rows. pyarrow quotes all text or none, so text that needs quotes is quoted here, cell by cell."""
+    special = [k for k, column in enumerate(batch.columns) if _needs_quotes(column, delimiter)]
+    if not special:
+        file.write(_plain_rows(batch, delimiter))
+        return
+    pieces: list[list[bytes]] = []
+    start = 0
+    for k in [*special, batch.num_columns]:
+        if k > start:
+            between = batch.select(list(range(start, k)))
+            pieces.append(bytes(_plain_rows(between, delimiter)).split(b"\n")[:-1])
+        if k < batch.num_columns:
+            cells = batch.column(k).to_pylist()
+            pieces.append([b"" if v is None else _quoted(v, delimiter).encode() for v in cells])
+        start = k + 1
+    file.write(b"\n".join(map(delimiter.encode().join, zip(*pieces))) + b"\n")
+
+
+def _plain_rows(batch: pa.RecordBatch, delimiter: str) -> pa.Buffer:
+    import pyarrow as pa
     import pyarrow.csv as pc
 
-    special = [delimiter.encode(), b'"', b"\n", b"\r"]
-    quoting = "none"
-    for column in batch.columns:
-        if str(column.type) in ("string", "large_string", "string_view", "binary", "large_binary"):
-            text = b"".join(bytes(b) for b in column.buffers()[2:] if b is not None)
-            if any(s in text for s in special):
-                quoting = "needed"
-        elif not _is_simple(column):
-            quoting = "needed"
-    pc.write_csv(batch, file, pc.WriteOptions(include_header=False, delimiter=delimiter, quoting_style=quoting))
+    sink = pa.BufferOutputStream()
+    pc.write_csv(batch, sink, pc.WriteOptions(include_header=False, delimiter=delimiter, quoting_style="none"))
+    return sink.getvalue()
 
 
-def _is_simple(column: pa.Array) -> bool:
-    """Numbers and booleans: their text never needs quotes."""
-    import pyarrow.types as pt
-
-    kind = column.type
-    return pt.is_integer(kind) or pt.is_floating(kind) or pt.is_boolean(kind) or pt.is_null(kind)
+def _needs_quotes(column: pa.Array, delimiter: str) -> bool:
+    """Whether a text column holds the delimiter, a quote or a line end; numbers never do."""
+    if str(column.type) not in ("string", "large_string"):
+        return False
+    data = column.buffers()[2]
+    text = b"" if data is None else bytes(data)
+    return any(mark in text for mark in (delimiter.encode(), b'"', b"\n", b"\r"))
 
 
 def _quoted(name: str, delimiter: str) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from margcal.core import lsq
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit
-from margcal.methods.affine import checked_rotations, tangents
+from margcal.methods.affine import checked_rotations, determinant3, tangents
 
 Solver = Callable[[Array, Array, float], Fit]
 """(readings (..., J, 3), rotations, magnitude) -> Fit."""
@@ -93,7 +93,8 @@ def cramer_rao(H: ArrayLike, u: ArrayLike, R: ArrayLike, sigma: ArrayLike) -> Bo
 class Scatter:
     """Estimates of many runs beside the truth and the bound; `H`, `B`, `u` are RMS error / bound.
 
-    `errors` holds (runs, 12) of (H row by row, B) and `u_errors` (runs, 3).
+    `errors` holds (runs, 12) of (H row by row, B) and `u_errors` (runs, 3), NaN where a run found nothing; `lost`
+    counts those runs, which the ratios leave out.
     """
 
     H: float
@@ -102,6 +103,7 @@ class Scatter:
     errors: Array
     u_errors: Array
     bound: Bound
+    lost: int = 0
 
 
 def simulated_readings(
@@ -141,15 +143,23 @@ def monte_carlo(
     H_hat = np.concatenate([f.model.H.reshape(-1, 3, 3) for f in fits])
     B_hat = np.concatenate([f.model.B.reshape(-1, 3) for f in fits])
     u_hat = np.concatenate([np.reshape(np.full(3, np.nan) if f.u is None else f.u, (-1, 3)) for f in fits])
-    sign = np.sign(np.linalg.det(H_hat) * np.linalg.det(H))
+    sign = np.sign(determinant3(H_hat) * determinant3(H))
     dH = H_hat * sign[:, None, None] - H
     dB, du = B_hat - B, u_hat * sign[:, None] - u
     bound = cramer_rao(H, u, R, sigma)
 
-    def ratio(error: Array, least: float) -> float:
-        return float(np.sqrt(np.mean(np.sum(error * error, axis=-1)))) / least
-
     errors = np.concatenate([dH.reshape(-1, 9), dB], axis=1)
+    found = np.isfinite(errors).all(axis=1)
+
+    def ratio(error: Array, least: float) -> float:
+        return float(np.sqrt(np.mean(np.sum(error[found] ** 2, axis=-1)))) / least
+
     return Scatter(
-        ratio(dH.reshape(-1, 9), bound.H_rms), ratio(dB, bound.B_rms), ratio(du, bound.u_rms), errors, du, bound
+        ratio(dH.reshape(-1, 9), bound.H_rms),
+        ratio(dB, bound.B_rms),
+        ratio(du, bound.u_rms),
+        errors,
+        du,
+        bound,
+        int(np.sum(~found)),
     )

@@ -72,7 +72,7 @@ def optimum(Z: Array, R: Array) -> tuple[Array, Array, Array]:
     """Unit vector u and matrix A that minimise ``sum |R_j u - A z_j|^2``; eigenvalues of M, ascending."""
     M, D, L = quadratic_form(Z, R)
     u, eigenvalues = smallest_eigenvector(M)
-    E = (D @ u[..., None, :, None])[..., 0]  # [basis, row of A]
+    E = (D.reshape(*u.shape[:-1], 9, 3) @ u[..., None]).reshape(M.shape)  # [basis, row of A]
     A = np.empty_like(M)
     A[..., 2] = E[..., 2, :] / L[..., 2, 2, None]
     A[..., 1] = (E[..., 1, :] - A[..., 2] * L[..., 2, 1, None]) / L[..., 1, 1, None]

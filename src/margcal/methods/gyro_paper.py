@@ -217,8 +217,7 @@ class _Path:
         self.iterates = [self.start]
 
     def keep(self, X: Array) -> None:
-        if not np.array_equal(X, self.iterates[-1]):
-            self.iterates.append(np.array(X))
+        self.iterates.append(np.array(X))
 
     def fit(self, method: str, raw_unit: str) -> Fit:
         path = self.iterates if len(self.iterates) > 1 else self.iterates * 2
@@ -316,10 +315,11 @@ def trust_region(
 
     def jacobian(X: Array) -> Array:
         # asked for at the start and once at every accepted iterate: the only hook in all SciPy versions
-        path.keep(X)
+        if cost.evaluations > 1:
+            path.keep(X)
         return cost.differences(X) if numerical else cost.jacobian(X)
 
-    found = least_squares(
+    least_squares(
         cost.residuals,
         path.start,
         jac=jacobian,  # type: ignore[arg-type]
@@ -329,5 +329,4 @@ def trust_region(
         ftol=1e-14,
         gtol=1e-14,
     )
-    path.keep(found.x)
     return path.fit("trust-region", raw_unit)

@@ -61,20 +61,30 @@ def linear_start(
     batch = pad(turns)
     z = batch.y - (np.zeros(3) if B is None else np.asarray(B, dtype=np.float64))
     v = _unit(np.asarray(along, dtype=np.float64))
-    # v(stop) - v(start) = sum [v]x H z dt, row by row of H: [v]x (kron) z
-    rate = (so3.skew(v)[..., :, :, None] * (z * batch.dt[..., None])[..., None, None, :]).reshape(*v.shape[:2], 3, 9)
-    rows, change = [rate.sum(axis=1)], [_ends(after, v[:, -1]) - _ends(before, v[:, 0])]
     lengths = (batch.dt > 0).sum(axis=1)
+    whole = np.ones(len(batch), dtype=int) * v.shape[1]
+    rows = [_rate_rows(v, z, batch.dt, 0 * whole, whole)]
+    change = [_ends(after, v[:, -1]) - _ends(before, v[:, 0])]
     for part in range(windows if windows > 1 else 0):
         start, stop = lengths * part // windows, np.maximum(lengths * (part + 1) // windows, 1)
-        index = np.arange(v.shape[1])
-        inside = (index >= start[:, None]) & (index < stop[:, None])
-        rows.append(np.einsum("tn,tnij->tij", inside.astype(np.float64), rate))
+        rows.append(_rate_rows(v, z, batch.dt, start, stop))
         change.append(_between(v, stop, lengths, after) - _between(v, start, lengths, before))
     A, b = np.concatenate(rows), np.concatenate(change)
     # the pieces carry the motion's acceleration at their ends, the whole turns do not
     weight = np.concatenate([np.ones(len(batch)), np.full(len(A) - len(batch), 0.3)])
     return _robust_rows(A, b, weight).reshape(3, 3)
+
+
+def _rate_rows(v: Array, z: Array, dt: Array, start: Array, stop: Array) -> Array:
+    """Rows (T, 3, 9) of ``sum [v]x H z dt`` over samples start <= n < stop, for H row by row."""
+    index = np.arange(v.shape[1])
+    inside = (index >= start[:, None]) & (index < stop[:, None])
+    moment = np.swapaxes(v, -1, -2) @ (z * np.where(inside, dt, 0.0)[..., None])  # sum v_a z_q dt
+    # [v]x_ip = -eps_ipa v_a: row i, entry p of H's rows, q of its columns
+    rows = np.zeros((len(v), 3, 3, 3))
+    for i, p, a in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rows[:, i, p], rows[:, p, i] = -moment[:, a], moment[:, a]
+    return rows.reshape(len(v), 3, 9)
 
 
 def _ends(given: ArrayLike | None, fallback: Array) -> Array:

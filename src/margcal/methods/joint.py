@@ -40,11 +40,15 @@ ANGLE_ERROR = 2e-4
 nonlinearity, sampling); the variance component scales it to what the data show."""
 FIRST_S_ROT = np.radians(0.3)
 """Start of the attitude error s_rot, rad, before it is estimated."""
-MIN_S_ROT = np.radians(0.005)
 COMPONENT_TOL = 1e-3
 """Relative change of a variance component that no longer matters: its own standard error is above 5 %."""
 MIN_REDUNDANCY = 3.0
 """A variance component with less redundancy than this is not estimated."""
+LEVEL_REDUNDANCY = 8.0
+"""The same for the table's tilt, which is told beforehand: only clear evidence corrects it."""
+FLOOR = {"rot": np.radians(0.005), "level": 0.02}
+"""Least value of a component, for the algebra's sake; of the others 0.7: scatter over sqrt(n) is about the least
+error that a mean can have."""
 
 
 @dataclass(frozen=True)
@@ -419,16 +423,15 @@ def _update_components(
 ) -> tuple[dict[str, float], float]:
     """sigma^2 <- v^T P v / redundancy for every component that the data can tell."""
     new, changed = dict(scale), 0.0
-    fixed = {"level", "vertical"} | ({"rot"} if priors.s_rot is not None else set())
+    fixed = {"vertical"} | ({"rot"} if priors.s_rot is not None else set())
     for b in blocks:
         if b.name in fixed:
             continue
         redundancy = _redundancy(b, inverse, parts)
-        if redundancy < MIN_REDUNDANCY:
+        if redundancy < (LEVEL_REDUNDANCY if b.name == "level" else MIN_REDUNDANCY):
             continue
         sigma = float(np.sqrt(b.r @ b.r / redundancy))
-        # scatter over sqrt(n) is the least error that a mean can have; s_rot has a floor for the algebra's sake
-        sigma = max(sigma, MIN_S_ROT if b.name == "rot" else 0.7)
+        sigma = max(sigma, FLOOR.get(b.name, 0.7))
         changed = max(changed, abs(sigma / _sigma(b.name, scale) - 1))
         new[b.name] = sigma
     return new, changed

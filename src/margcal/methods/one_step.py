@@ -97,7 +97,7 @@ def one_step(
     if lost.any():
         A[lost], u[lost] = np.nan, np.nan
     H, u = magnitude * A, magnitude * u
-    B = centre - np.einsum("...ij,...jk,...k->...i", inverse3(H), R_mean, u)
+    B = centre - (inverse3(H) @ (R_mean @ u[..., None]))[..., 0]
     misfit = predicted(Rc, u) - Z @ np.swapaxes(H, -1, -2)
     squares = np.einsum("...ji,...ji->...j", misfit, misfit)
     residual = np.sqrt(squares)

@@ -33,6 +33,7 @@ from margcal.methods.affine import (
     As,
     checked_readings,
     checked_rotations,
+    determinant3,
     model_of,
     pose_residual,
     positive,
@@ -164,7 +165,7 @@ def _angle(a: Array, b: Array) -> Array:
 def _rescaled(H: Array, u: Array, magnitude: float) -> tuple[Array, Array, Array]:
     """(32), and the sign that makes det H positive."""
     factor = magnitude / np.linalg.norm(u, axis=-1)
-    sign = np.where(np.linalg.det(H) < 0, -1.0, 1.0)
+    sign = np.where(determinant3(H) < 0, -1.0, 1.0)
     factor = factor * sign
     return H * factor[..., None, None], u * factor[..., None], sign
 

@@ -20,7 +20,7 @@ import numpy as np
 from margcal.core.checking import printable
 from margcal.core.errors import InputError
 from margcal.core.types import Array, Calibration, Kind, SensorModel
-from margcal.core.units import SI_COLUMN, UNITS
+from margcal.core.units import KINDS, SI_COLUMN, UNITS
 from margcal.files.atomic import atomic_folder, atomic_path
 from margcal.files.batches import (
     As,
@@ -28,8 +28,8 @@ from margcal.files.batches import (
     Progress,
     Table,
     arrow,
+    cells,
     is_parquet,
-    nan_to_null,
     numbers,
     open_table,
 )
@@ -89,7 +89,7 @@ def apply_file(
     if target.exists() and source.exists() and os.path.samefile(source, target):
         raise InputError(f"{printable(target)}: is the recording itself; give the result another name")
     summary: dict[str, Any] = {"rows": 0, "seconds": None, "files": [], "sensors": {}, "forced": []}
-    passed: set[str] = set()
+    passed: set[Kind] = set()
     if source.is_dir():
         jobs = [_job(calibration, p, units, force) for p in tables_in(source)]
         _check_found(calibration, jobs, source)
@@ -107,7 +107,7 @@ def apply_file(
         with atomic_path(target, overwrite=overwrite) as temporary:
             _write(job, temporary, summary, progress)
         passed |= job.passed
-    summary["passed_through"] = [k for k in UNITS if k in passed]
+    summary["passed_through"] = [k for k in KINDS if k in passed]
     summary["missing"] = [k for k in calibration.models if k not in summary["sensors"]]
     return summary
 
@@ -139,7 +139,7 @@ class _Job:
     table: Table
     columns: Columns
     sensors: dict[Kind, _Sensor]
-    passed: set[str]
+    passed: set[Kind]
     names: list[str] = field(default_factory=list)
 
     @property
@@ -264,7 +264,7 @@ def _output(job: _Job, batch: pa.RecordBatch, vectors: Mapping[Kind, Array], *, 
     """`batch` with the calibrated columns in place of the raw ones."""
     import pyarrow as pa
 
-    arrays = [nan_to_null(column) if nan_is_null else column for column in batch.columns]
+    arrays = [cells(column) if nan_is_null else column for column in batch.columns]
     for kind, sensor in job.sensors.items():
         for j, k in enumerate(sensor.columns.index):
             arrays[k] = arrow(vectors[kind][:, j], nan_is_null=nan_is_null)
@@ -277,11 +277,12 @@ _Part = tuple["pa.RecordBatch", dict[Kind, Array]]
 def _corrected(job: _Job, take: Mapping[int, As], progress: Progress | None) -> Iterator[_Part]:
     """Batches with their calibrated vectors, delays corrected."""
     every = range(len(job.names))
-    parts = (
-        (batch, {kind: sensor.calibrated(batch) for kind, sensor in job.sensors.items()})
-        for batch in job.table.batches(every, take, progress=progress)
-    )
-    return _Delays(job).corrected(parts) if job.delays else parts
+
+    def parts() -> Iterator[_Part]:
+        for batch in job.table.batches(every, take, progress=progress):
+            yield batch, {kind: sensor.calibrated(batch) for kind, sensor in job.sensors.items()}
+
+    return _Delays(job).corrected(parts()) if job.delays else parts()
 
 
 @dataclass
@@ -333,7 +334,7 @@ class _Delays:
 
     def __init__(self, job: _Job) -> None:
         self.job = job
-        self.tracks = {kind: _Track(delay) for kind, delay in job.delays.items()}
+        self.tracks: dict[Kind, _Track] = {kind: _Track(delay) for kind, delay in job.delays.items()}
         self.waiting: deque[tuple[Array, _Part]] = deque()
         self.rows = 0
         self.last = -np.inf
