@@ -53,7 +53,8 @@ def rests(t: Array, y: Array, sd: float, shortest: float = 1.0, window: int = 50
     return [slice(a, b) for a, b in zip(edges[::2], edges[1::2]) if t[b - 1] - t[a] > shortest]
 
 
-# --------------------------------------------------------------------------------------------------- noise-free
+# --------------------------------------------------------------------------------------------------- noise-
+# free
 
 
 @pytest.mark.parametrize("solve", [ellipsoid, triangular, adjusted_ellipsoid])
@@ -80,7 +81,8 @@ def test_each_gauge():
     assert np.diag(U).min() > 0
 
 
-# ------------------------------------------------------------------------------------------- the paper's identities
+# ------------------------------------------------------------------------------------------- the paper's
+# identities
 
 
 def test_K_squared_is_G_squared_Sigma():
@@ -112,7 +114,8 @@ def test_triangular_and_symmetric_agree_up_to_a_rotation():
     assert np.allclose(a.H.T @ a.H, b.H.T @ b.H, rtol=1e-4, atol=1e-8)
 
 
-# --------------------------------------------------------------------------------------------- geometry underneath
+# --------------------------------------------------------------------------------------------- geometry
+# underneath
 
 
 def test_distance_is_to_the_nearest_point():
@@ -154,7 +157,8 @@ def test_orthogonal_fit_has_no_better_neighbour():
         assert other @ other > fit.cost
 
 
-# ------------------------------------------------------------------------------------------------------- statistics
+# -------------------------------------------------------------------------------------------------------
+# statistics
 
 
 @pytest.mark.parametrize("solve", [ellipsoid, triangular])
@@ -206,7 +210,8 @@ def test_adjusted_fit_survives_outliers_and_names_them():
     assert fit.details["weights"][60:].mean() > 0.98
 
 
-# ----------------------------------------------------------------------------------------------------- what is refused
+# ----------------------------------------------------------------------------------------------------- what
+# is refused
 
 
 def test_too_few_directions_names_found_and_needed():
@@ -243,7 +248,8 @@ def test_distinct_directions_counts_what_was_put_in():
     assert distinct_directions(readings(axes)) == 6
 
 
-# ------------------------------------------------------------------------------------------------ real recordings
+# ------------------------------------------------------------------------------------------------ real
+# recordings
 
 
 @needs_data

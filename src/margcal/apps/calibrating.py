@@ -10,7 +10,7 @@ from typing import Any
 
 from margcal.apps import screen
 from margcal.apps.outputs import check_outputs
-from margcal.core.errors import DataError, UsageError
+from margcal.core.errors import DataError, InputError, UsageError
 from margcal.core.types import Calibration, Kind, Recording
 from margcal.core.units import KINDS
 from margcal.files.tables import read
@@ -95,7 +95,8 @@ def _poses(text: str) -> Any:
     if text in MODES:
         return text
     if not Path(text).exists():
-        raise UsageError(f"--poses: {text!r} is none of {', '.join(MODES)}, and there is no such file")
+        kind = UsageError if Path(text).suffix == "" and Path(text).name == text else InputError
+        raise kind(f"--poses: {text!r} is none of {', '.join(MODES)}, and there is no such file")
     from margcal.files.poses_table import read_poses
 
     return read_poses(text)

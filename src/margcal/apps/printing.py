@@ -45,8 +45,8 @@ def show_attitudes(calibration: Calibration) -> None:
     settings = calibration.settings
     taken, text = settings.get("attitudes"), settings.get("attitudes_text")
     if taken:
-        told = "as told" if settings.get("poses") not in (None, "auto") else "found out"
-        screen.line(f"attitudes: {taken} ({told}): {text}")
+        told = "as told" if settings.get("poses") not in (None, "auto") else "inferred"
+        screen.line(f"attitudes: {taken}, {told}: {text}")
     frame = FRAMES.get(calibration.frame, "")
     screen.line(f"frame:     {calibration.frame}{': ' + frame if frame else ''}")
     if gravity := settings.get("gravity"):
@@ -102,11 +102,11 @@ def _show_matrices(calibration: Calibration) -> None:
     rows = []
     for kind, model in calibration.models.items():
         for k in range(3):
-            cells = [f"{v: .8g}" for v in model.H[k]]
+            cells = [f"{v:.9e}" for v in model.H[k]]
             rows.append([kind if k == 0 else "", *cells, f"{model.B[k]:.9g}"])
     screen.line()
     screen.line("u = H (y - B), y the raw reading:")
-    screen.table(["", "H", "", "", "B"], rows, right=(4,))
+    screen.table(["", "H", "", "", "B"], rows, right=(1, 2, 3, 4))
 
 
 def show_issues(issues: Sequence[Issue]) -> None:
@@ -144,3 +144,14 @@ def show_rests(poses: Poses, sources: Sequence[str]) -> None:
 
 def _triple(values: Array) -> str:
     return " ".join(figure(float(v), 5) for v in values)
+
+
+def show_residuals(calibration: Calibration) -> None:
+    """What is left over at the rests of the recordings that the calibration was held against."""
+    rows = []
+    for kind, fit in calibration.fits.items():
+        unit = "deg (up after each turn)" if kind == "gyr" else f"{fit.model.unit} (length at rest)"
+        residual = np.degrees(fit.residual) if kind == "gyr" else np.asarray(fit.residual)
+        rms, worst = float(np.sqrt(np.mean(residual**2))), float(np.abs(residual).max())
+        rows.append([NAMES[kind], str(residual.size), figure(rms, 3), figure(worst, 3), unit])
+    screen.table(["left over", "number", "rms", "worst", "unit"], rows, right=(1, 2, 3))

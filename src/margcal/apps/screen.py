@@ -20,8 +20,7 @@ SHOWN_AFTER_S = 0.8
 
 def clean(text: object) -> str:
     """`text` on one line, control characters (terminal escapes) replaced by ``?``."""
-    words = " ".join(str(text).split())
-    return "".join(c if c.isprintable() else "?" for c in words)
+    return "".join(c if c.isprintable() else " " if c in "\n\r\t" else "?" for c in str(text))
 
 
 def line(text: str = "", *, style: str = "") -> None:

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from margcal.core.checking import printable
 from margcal.core.errors import InputError
 from margcal.core.types import Array, Issue
-from margcal.files.text import Dialect, TextLines, sniff
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from margcal.files.text import Dialect, TextLines
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".csv.gz", ".txt.gz", ".tsv.gz")
 CSV_BLOCK = 4 << 20
@@ -124,7 +125,7 @@ class Table:
                 break
             except BadCell as bad:
                 if len(dropped) + 1 > skip_bad:
-                    raise InputError(str(bad)) from bad
+                    raise
                 dropped.add(bad.row)
         count = len(dropped) + len(ragged)
         if count:
@@ -144,6 +145,8 @@ class Table:
     ) -> Iterator[pa.RecordBatch]:
         import pyarrow as pa
         import pyarrow.csv as pc
+
+        from margcal.files.text import TextLines
 
         kinds = {"number": pa.float64(), "text": pa.string()}
         types = {str(k): kinds[take[k]] for k in columns if take.get(k, "own") != "own"}
@@ -228,6 +231,8 @@ def open_table(path: Path) -> Table:
         raise InputError(f"{printable(path)}: cannot be read ({error.strerror})") from error
     if is_parquet(path):
         return _open_parquet(path, size)
+    from margcal.files.text import sniff
+
     dialect = sniff(path)
     table = Table(path, dialect.names, dialect, None, size)
     if dialect.decimal == ",":
@@ -279,7 +284,7 @@ def numbers(array: pa.Array) -> Array:
         return np.concatenate(parts) if len(parts) != 1 else parts[0]
     kind = str(array.type)
     plain = {"double": "f8", "float": "f4", "halffloat": "f2"}.get(kind)
-    if plain is None and re.fullmatch(r"u?int(8|16|32|64)", kind):
+    if plain is None and kind.lstrip("u").startswith("int"):
         plain = kind
     if plain is None:
         return np.array([np.nan if v is None else float(v) for v in array.to_pylist()], dtype=np.float64)

@@ -14,7 +14,6 @@ from margcal.core.units import KINDS, UNITS
 
 _SENSOR = re.compile(r"(acc|gyr|mag)_([xyz])(?:_([a-z0-9]+))?", re.IGNORECASE)
 _POSITION = re.compile(r"ref_p_([xyz])_(m|mm)", re.IGNORECASE)
-_MEANT = re.compile(r"t_s|temp_degc|(acc|gyr|mag)_[xyz](_.*)?|ref_q[wxyz]|ref_p_[xyz]_.*")
 _SPELLING = {kind: {unit.lower(): unit for unit in UNITS[kind]} for kind in KINDS}
 
 
@@ -65,7 +64,7 @@ def find_columns(names: Sequence[str], units: Mapping[str, str] | None, file: st
     """
     check_units(units)
     lower = [n.lower() for n in names]
-    keys = [n if _MEANT.fullmatch(n) else exact for n, exact in zip(lower, names)]
+    keys = [n if n.startswith(("t_s", "temp_", "acc_", "gyr_", "mag_", "ref_")) else e for n, e in zip(lower, names)]
     for name, count in Counter(k for k in keys if k).items():
         if count > 1:
             places = ", ".join(str(k + 1) for k, n in enumerate(keys) if n == name)
@@ -123,9 +122,13 @@ def _find_sensor(kind: Kind, names: Sequence[str], declared: str | None, file: s
     return SensorColumns(kind, unit, (axes["x"], axes["y"], axes["z"]), relabelled)
 
 
-def _choose_set(kind: Kind, sets: Mapping[str | None, object], declared: str | None, file: str) -> str | None:
+def _choose_set(
+    kind: Kind, sets: Mapping[str | None, Mapping[str, int]], declared: str | None, file: str
+) -> str | None:
     """Which of a sensor's column sets to take, by the unit in the names."""
     known = [u for u in sets if u in UNITS[kind]]
+    if len(known) > 1:  # stray columns beside one whole sensor do not make it doubtful
+        known = [u for u in known if len(sets[u]) == 3] or known
     if declared is not None:
         if declared in sets:
             return declared

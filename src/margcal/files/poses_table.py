@@ -14,8 +14,8 @@ from margcal.core.checking import NORM_REFUSED, printable
 from margcal.core.errors import InputError
 from margcal.core.types import Array
 from margcal.files.batches import Table, open_table
+from margcal.files.writing import AXES
 
-AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 
 

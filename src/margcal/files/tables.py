@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,10 @@ from margcal.core.types import Array, Issue, Kind, Recording, Reference, Stream
 from margcal.core.units import KINDS
 from margcal.files.batches import Progress, Table, is_table, numbers, open_table
 from margcal.files.columns import Columns, check_units, find_columns
-from margcal.files.poses_table import PoseTable, read_poses
-from margcal.files.writing import write_table
+
+if TYPE_CHECKING:
+    from margcal.files.poses_table import PoseTable, read_poses
+    from margcal.files.writing import write_table
 
 __all__ = ["PoseTable", "read", "read_poses", "tables_in", "write_table"]
 
@@ -33,6 +35,16 @@ NAN_LIMIT = 0.05
 
 _BRIDGED = 1.6
 """Samples this many usual steps apart still follow each other; farther apart, something is missing between."""
+
+
+def __getattr__(name: str) -> Any:
+    """`write_table`, `read_poses`, `PoseTable` from their own modules, when first asked for."""
+    from margcal.files import poses_table, writing
+
+    for module in (poses_table, writing):
+        if name in __all__ and hasattr(module, name):
+            return getattr(module, name)
+    raise AttributeError(name)
 
 
 def read(
@@ -262,7 +274,7 @@ def _lost_rows(t: Array, valid: NDArray[np.bool_], empty: NDArray[np.bool_]) -> 
     at = np.flatnonzero(valid)
     if len(at) < 3:
         return int(empty.sum())
-    usual = float(np.median(np.diff(t[at])))
+    usual = _median(np.diff(t[at]))
     before = np.concatenate([[0], np.cumsum(empty)])
     inside = before[at[1:]] - before[at[:-1]]
     lost = int(inside[np.diff(t[at]) > _BRIDGED * usual].sum())
@@ -272,9 +284,14 @@ def _lost_rows(t: Array, valid: NDArray[np.bool_], empty: NDArray[np.bool_]) -> 
     return lost
 
 
+def _median(values: NDArray[Any]) -> float:
+    """Upper median; np.median imports numpy.ma, which costs 10 ms at the first call."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
 def _reference(t: Array, q: Array, p: Array | None) -> Reference:
     """Rows of a slower reference in a faster table are left out; the others stay, NaN where nothing was seen."""
     seen = ~np.isnan(q).any(axis=1)
-    if seen.sum() >= 3 and np.median(np.diff(np.flatnonzero(seen))) >= 2:
+    if seen.sum() >= 3 and _median(np.diff(np.flatnonzero(seen))) >= 2:
         return Reference(t[seen], q[seen], None if p is None else p[seen])
     return Reference(t, q, p)

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 _TEXT = (".csv", ".txt", ".tsv", ".csv.gz", ".txt.gz", ".tsv.gz")
 
+AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""The names of a housing's axes, as a poses table spells them."""
+
 Write = Callable[["pa.RecordBatch"], None]
 
 
@@ -77,7 +80,7 @@ def _column(values: Any, *, csv: bool) -> pa.Array:
 
 def _harmless(text: str) -> str:
     """`text` with ``'`` before what a spreadsheet would take for a formula; axis names and numbers stay."""
-    if not text.startswith(("=", "+", "-", "@", "\t", "\r")) or text[1:] in ("x", "y", "z"):
+    if not text.startswith(("=", "+", "-", "@", "\t", "\r")) or text in AXES:
         return text
     try:
         float(text)

@@ -69,7 +69,7 @@ def checked_rotations(R: ArrayLike, n_poses: int) -> Array:
     if R.ndim < 3 or R.shape[-2:] != (3, 3) or R.shape[-3] != n_poses:
         raise InputError(f"rotations have shape {R.shape}; expected (..., {n_poses}, 3, 3), one a pose")
     wrong = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2)) > 1e-6
-    wrong |= np.linalg.det(R) < 0
+    wrong |= determinant3(R) < 0
     if wrong.any():
         raise InputError(f"rotation {int(np.argwhere(wrong)[0][-1])} is not a rotation (orthogonal, det +1)")
     return R

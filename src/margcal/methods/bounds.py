@@ -93,8 +93,8 @@ def cramer_rao(H: ArrayLike, u: ArrayLike, R: ArrayLike, sigma: ArrayLike) -> Bo
 class Scatter:
     """Estimates of many runs beside the truth and the bound; `H`, `B`, `u` are RMS error / bound.
 
-    `errors` holds (runs, 12) of (H row by row, B) and `u_errors` (runs, 3), NaN where a run found nothing; `lost`
-    counts those runs, which the ratios leave out.
+    `errors` holds (runs, 12) of (H row by row, B) and `u_errors` (runs, 3), NaN where a run found nothing;
+    `lost` counts those runs, which the ratios leave out.
     """
 
     H: float

@@ -70,9 +70,9 @@ def _scaled_starts(problem: Problem, H0: Array) -> Iterable[Array]:
 
 def _to_fit(problem: Problem, run: Run, residual: Array, method: str, raw_unit: str) -> Fit:
     covariance = None
-    if run.covariance is not None and run.rank == problem.n_unknown:
+    if run.last.covariance is not None and run.last.rank == problem.n_unknown:
         covariance = np.zeros((12, 12))
-        covariance[: problem.n_unknown, : problem.n_unknown] = run.covariance
+        covariance[: problem.n_unknown, : problem.n_unknown] = run.last.covariance
     used = problem.dof > 0
     rms = float(np.sqrt(np.mean(residual[used] ** 2)))
     model = SensorModel(
@@ -86,9 +86,9 @@ def _to_fit(problem: Problem, run: Run, residual: Array, method: str, raw_unit: 
         method=method,
     )
     text = ""
-    if run.rank < problem.n_unknown:
+    if run.last.rank < problem.n_unknown:
         text = (
-            f"the turns determine only {run.rank} of {problem.n_unknown} unknowns of the gyroscope; "
+            f"the turns determine only {run.last.rank} of {problem.n_unknown} unknowns of the gyroscope; "
             "turn the node about at least three different axes, several times each"
         )
     elif run.typical > misfit_limit(problem, run):
@@ -114,8 +114,8 @@ def _to_fit(problem: Problem, run: Run, residual: Array, method: str, raw_unit: 
         method,
         CITES,
         covariance=covariance,
-        rank=run.rank,
-        condition=run.condition,
+        rank=run.last.rank,
+        condition=run.last.condition,
         n_iter=len(run.H) - 1,
         converged=not text,
         history=history,
@@ -162,7 +162,7 @@ def gauss_newton(
     sd: ArrayLike | None = None,
     sigma_angle: float | None = None,
     max_iter: int = 20,
-    tol: float = 1e-6,
+    tol: float = 1e-3,
     raw_unit: str = "count",
 ) -> Fit:
     """H and B of the gyroscope from turns whose rotations are known: Gauss-Newton on SO(3).
@@ -184,7 +184,7 @@ def gauss_newton(
     sigma_angle : float, rad, optional
         Noise of the known rotations, each axis. Without it, what the misfits show beyond `sd`.
     max_iter, tol : int, float
-        Stop at this relative step of H.
+        Stop after so many iterations, or with the step that is shorter than `tol` standard errors.
 
     Returns
     -------
@@ -229,7 +229,7 @@ def propagate_gravity(
     sd: ArrayLike | None = None,
     sigma_angle: float | None = None,
     max_iter: int = 30,
-    tol: float = 1e-6,
+    tol: float = 1e-3,
     raw_unit: str = "count",
 ) -> Fit:
     """H and B of the gyroscope from turns at whose ends directions are known in the node frame.

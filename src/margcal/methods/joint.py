@@ -38,6 +38,8 @@ from margcal.methods.preintegration import TurnBatch, integrate, preintegrate
 ANGLE_ERROR = 2e-4
 """Error of an integrated turn beside the white noise, as a fraction of the angle turned (g-sensitivity,
 nonlinearity, sampling); the variance component scales it to what the data show."""
+SAMPLING_ERROR = 0.1
+"""Error of one sampling interval as a fraction of the angle by which the rate's second difference misses."""
 FIRST_S_ROT = np.radians(0.3)
 """Start of the attitude error s_rot, rad, before it is estimated."""
 COMPONENT_TOL = 1e-3
@@ -331,12 +333,21 @@ def _turn_block(gyro: Gyro, layout: _Layout, state: _State) -> _Block:
     J[:, :, layout.B["gyr"]] = -left @ pre.J_B
     _put(J, layout.R[gyro.before], -left @ back)
     _put(J, layout.R[gyro.after], right)
-    rate = np.linalg.norm((gyro.turns.y - B) @ H.T, axis=-1)
-    angle = np.sum(rate * gyro.turns.dt, axis=-1)
-    C = pre.C + (ANGLE_ERROR * angle)[:, None, None] ** 2 * np.eye(3)
+    C = pre.C + _turn_variance(gyro.turns, H, B)[:, None, None] * np.eye(3)
     W = np.linalg.inv(np.linalg.cholesky(C))
     r, J = np.einsum("tij,tj->ti", W, r), W @ J
     return _Block("turn", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 3))
+
+
+def _turn_variance(turns: TurnBatch, H: Array, B: Array) -> Array:
+    """Variance (T,), rad^2, of integrated turns beside the white noise: a share of the angle turned, and what
+    happens between samples, for which the second differences of the rate are the measure (a clattering box shakes
+    faster than it is sampled)."""
+    u = (turns.y - B) @ H.T
+    inside = turns.dt[:, 1:-1] > 0
+    bend = np.linalg.norm(u[:, :-2] - 2 * u[:, 1:-1] + u[:, 2:], axis=-1) * turns.dt[:, 1:-1] * inside
+    angle = np.sum(np.linalg.norm(u, axis=-1) * turns.dt, axis=-1)
+    return (ANGLE_ERROR * angle) ** 2 + SAMPLING_ERROR**2 * np.sum(bend**2, axis=-1)
 
 
 def _attitude_block(R0: Array, layout: _Layout, state: _State) -> _Block:

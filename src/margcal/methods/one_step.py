@@ -25,12 +25,11 @@ from margcal.methods.affine import (
     inverse3,
     model_of,
     pose_residual,
-    predicted,
     scaled,
     tangents,
     unscaled_covariance,
 )
-from margcal.methods.elimination import HOPELESS, optimum, refuse_unobservable
+from margcal.methods.elimination import optimum, refuse_unobservable
 
 
 def one_step(
@@ -87,26 +86,21 @@ def one_step(
     y = checked_readings(y, kind, MIN_POSES)
     R = checked_rotations(R, y.shape[-2])
     w = _checked_weights(weights, y.shape[-2])
-    centre, R_mean = _mean_readings(y, w), _mean_rotations(R, w)
-    Z, Rc = y - centre[..., None, :], R - R_mean[..., None, :, :]
-    Zw, Rw = (Z, Rc) if w is None else (Z * np.sqrt(w)[..., None], Rc * np.sqrt(w)[..., None, None])
-    u, A, eigenvalues = optimum(Zw, Rw)
+    best = optimum(y, R, w, centred=True)
     if y.ndim == 2:
-        refuse_unobservable(kind, R, u, eigenvalues)
-    lost = eigenvalues[..., 1] < HOPELESS * y.shape[-2]
-    if lost.any():
-        A[lost], u[lost] = np.nan, np.nan
-    H, u = magnitude * A, magnitude * u
-    B = centre - (inverse3(H) @ (R_mean @ u[..., None]))[..., 0]
-    misfit = predicted(Rc, u) - Z @ np.swapaxes(H, -1, -2)
-    squares = np.einsum("...ji,...ji->...j", misfit, misfit)
+        refuse_unobservable(kind, R, best.u, best.eigenvalues)
+    else:
+        best.A[best.lost], best.u[best.lost] = np.nan, np.nan
+    H, u = magnitude * best.A, magnitude * best.u
+    B = best.centre - (inverse3(best.A) @ best.turned[..., None])[..., 0]
+    squares = magnitude**2 * best.squares
     residual = np.sqrt(squares)
-    details = {"lambda": eigenvalues / y.shape[-2]}
+    details = {"lambda": best.eigenvalues / y.shape[-2]}
     cov, rank, condition = None, 14, float("nan")
     if covariance or (covariance is None and y.ndim == 2):
         cov, rank, condition, extra = _uncertainty(y, R, H, B, u, magnitude, w, sigma)
         details |= extra
-    text = f"{int(lost.sum())} of {lost.size} nodes: their poses do not determine H" if lost.any() else ""
+    n_lost = int(best.lost.sum()) if y.ndim > 2 else 0
     return Fit(
         model_of(As(kind, raw_unit, unit), H, B, "one-step", residual, cov),
         residual,
@@ -117,9 +111,9 @@ def one_step(
         covariance=cov,
         rank=rank,
         condition=condition,
-        converged=not lost.any(),
+        converged=n_lost == 0,
         details=details,
-        text=text,
+        text=f"{n_lost} of {best.lost.size} nodes: their poses do not determine H" if n_lost else "",
     )
 
 
@@ -131,17 +125,6 @@ def _checked_weights(weights: ArrayLike | None, J: int) -> Array | None:
     if w.shape[-1:] != (J,) or not (np.isfinite(w).all() and (w > 0).all()):
         raise InputError(f"weights must be {J} positive numbers, one a pose; got shape {w.shape}")
     return w / w.mean(axis=-1, keepdims=True)
-
-
-def _mean_readings(y: Array, w: Array | None) -> Array:
-    J = y.shape[-2]
-    return np.full(J, 1 / J) @ y if w is None else (w[..., None, :] @ y)[..., 0, :] / J
-
-
-def _mean_rotations(R: Array, w: Array | None) -> Array:
-    if w is None:
-        return R.mean(axis=-3)
-    return np.einsum("...j,...jik->...ik", w, np.broadcast_to(R, (*w.shape[:-1], *R.shape[-3:]))) / R.shape[-3]
 
 
 def _uncertainty(

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 from margcal.core import lsq
 from margcal.core.errors import InputError
 from margcal.core.types import Array, Fit, Kind
+from margcal.methods import two_step
 from margcal.methods.affine import (
     MIN_POSES,
     As,
@@ -57,12 +58,33 @@ def two_step_bias(y: Array, magnitude: float, kind: Kind, bias: ArrayLike | None
     return np.broadcast_to(B, (*y.shape[:-2], 3))
 
 
-def _fit(name: As, y: Array, R: Array, H: Array, B: Array, u: Array, method: str, cites: str, **more: object) -> Fit:
+def _fit(
+    name: As,
+    y: Array,
+    R: Array,
+    H: Array,
+    B: Array,
+    u: Array,
+    method: str,
+    cites: str,
+    covariance: Array | None,
+    **more: object,
+) -> Fit:
     """The `Fit` of a two-step method: residual norms of (25) and their sum of squares."""
     residual = np.linalg.norm(pose_residual(y, R, H, B, u), axis=-1)
-    model = model_of(name, H, B, method, residual)
+    model = model_of(name, H, B, method, residual, covariance)
     cost = np.sum(residual * residual, axis=-1)
-    return Fit(model, residual, cost, method, cites, u=u, rank=11, **more)  # type: ignore[arg-type]
+    return Fit(model, residual, cost, method, cites, u=u, covariance=covariance, rank=11, **more)  # type: ignore[arg-type]
+
+
+def _covariance(
+    y: Array, R: Array, H: Array, B: Array, u: Array, magnitude: float, bias: ArrayLike | None
+) -> Array | None:
+    """Of a single node's optimum of (25)-(26); a bias that was given counts as exact."""
+    if y.ndim > 2:
+        return None
+    dB = two_step.bias_response(y, H, B, magnitude) if bias is None else np.zeros((3, len(y), 3))
+    return two_step.covariance(y, R, H, B, u, two_step.transform_response(y, R, H, B, u, dB), dB)
 
 
 def alternation(
@@ -87,7 +109,7 @@ def alternation(
     R : array_like (J, 3, 3) or (..., J, 3, 3)
     magnitude : float, calibrated unit
     bias : array_like (..., 3), raw unit, optional
-        Combined bias; from `ellipsoid` where not given.
+        Combined bias; from `ellipsoid` where not given. A bias that is given counts as exact in the covariance.
     u0 : array_like (..., 3), optional
         Initial vector, any length; ``(1, 1, 1)`` where not given (the paper leaves it open).
     n_iter : int
@@ -140,6 +162,7 @@ def alternation(
         u,
         "alternation",
         "Z-TIE (27)-(32)",
+        _covariance(y, R, H, B, u, magnitude, bias),
         history=history,
         details={"turned": turned},
         n_iter=len(all_u),
@@ -203,19 +226,23 @@ def eigen(
     y = checked_readings(y, kind, MIN_POSES)
     R = checked_rotations(R, y.shape[-2])
     B = two_step_bias(y, magnitude, kind, bias)
-    u, A, eigenvalues = optimum(y - B[..., None, :], R)
+    best = optimum(y - B[..., None, :], R, centred=False)
     if y.ndim == 2:
-        refuse_unobservable(kind, R, u, eigenvalues)
+        refuse_unobservable(kind, R, best.u, best.eigenvalues)
+    else:
+        best.A[best.lost], best.u[best.lost] = np.nan, np.nan
+    H, u = magnitude * best.A, magnitude * best.u
     return _fit(
         As(kind, raw_unit, unit),
         y,
         R,
-        magnitude * A,
+        H,
         B,
-        magnitude * u,
+        u,
         "eigen",
         "not in the papers: the global optimum of Z-TIE (25)-(26)",
-        details={"lambda": eigenvalues / y.shape[-2]},
+        _covariance(y, R, H, B, u, magnitude, bias),
+        details={"lambda": best.eigenvalues / y.shape[-2]},
     )
 
 
@@ -268,7 +295,12 @@ def svd(
     u_v, H_v = X[..., :3], X[..., 3:].reshape(*X.shape[:-1], 3, 3) / unit_scale[..., None, None]  # (28)
     kappa = np.sqrt(magnitude**2 / np.sum(u_v * u_v, axis=-1))  # (33)
     H, u = positive(kappa[..., None, None] * H_v, kappa[..., None] * u_v)
-    u = np.einsum("...ji,...j->...i", R_i, u)  # back from the reference pose to the frame of R
+    covariance, u_i = None, u
+    u = np.einsum("...ji,...j->...i", R_i, u_i)  # back from the reference pose to the frame of R
+    if y.ndim == 2:
+        dB = two_step.bias_response(y, H, B, magnitude) if bias is None else np.zeros((3, len(y), 3))
+        raw_A = _homogeneous_matrix(R_ji[others], Delta)
+        covariance = two_step.covariance(y, R, H, B, u, two_step.homogeneous_response(raw_A, H, u_i, reference), dB)
     # not in the paper: columns of unit length make the ratio comparable between sensors
     lengths = np.linalg.norm(A, axis=-2, keepdims=True)
     scaled_values = np.linalg.svd(A / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
@@ -282,6 +314,7 @@ def svd(
         u,
         "svd",
         "ZY-TBME (23)-(33)",
+        covariance,
         condition=ratio,
         details={"singular_values": singular_values, "ratio": ratio},
     )

@@ -191,8 +191,8 @@ def _check_found(calibration: Calibration, jobs: list[_Job], source: Path) -> No
         return
     have = sorted({k for job in jobs for k in job.columns.sensors})
     raise InputError(
-        f"{printable(source.name)}: nothing to calibrate: it holds {', '.join(have) or 'no sensor'}, the calibration is "
-        f"of {', '.join(calibration.models) or 'no sensor'}"
+        f"{printable(source.name)}: nothing to calibrate: it holds {', '.join(have) or 'no sensor'}, the calibration "
+        f"is of {', '.join(calibration.models) or 'no sensor'}"
     )
 
 

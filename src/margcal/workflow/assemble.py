@@ -11,7 +11,10 @@ from margcal.core import so3
 from margcal.core.types import Array, Calibration, Fit, Issue, Kind, Recording, SensorModel
 from margcal.core.units import KINDS
 from margcal.methods.uncertainty import expected_error
-from margcal.workflow.job import Job, Solved
+from margcal.workflow.job import NAMES, Job, Solved
+
+MAX_ERROR_DEG = 2.0
+"""Expected direction error above which a sensor is refused (conventions: `fail`)."""
 
 
 def assemble(job: Job, solved: Solved, issues: list[Issue]) -> Calibration:
@@ -20,8 +23,13 @@ def assemble(job: Job, solved: Solved, issues: list[Issue]) -> Calibration:
     models: dict[Kind, SensorModel] = {}
     for kind in (k for k in KINDS if k in solved.fits):
         fit = _signed(job, kind, solved, issues)
-        models[kind] = _finished(job, kind, fit, solved)
-        solved.fits[kind] = replace(fit, model=models[kind])
+        model = _finished(job, kind, fit, solved)
+        solved.fits[kind] = replace(fit, model=model)
+        doubt = _too_uncertain(model)
+        if doubt is None:
+            models[kind] = model
+        else:
+            issues.append(doubt)
     _mirrored(models, issues)
     return Calibration(
         acc=models.get("acc"),
@@ -122,6 +130,19 @@ def _finished(job: Job, kind: Kind, fit: Fit, solved: Solved) -> SensorModel:
         delay_se_s=delay[1],
         temperature_degC=_temperature(job),
     )
+
+
+def _too_uncertain(model: SensorModel) -> Issue | None:
+    """Why a model is not handed out: its own covariance says that its directions mean nothing."""
+    error = model.expected_error_deg
+    if error is None or error <= MAX_ERROR_DEG:
+        return None
+    name = NAMES[model.kind]
+    text = (
+        f"{name}: the recording leaves its directions open (expected error {min(error, 180):.1f} degrees, limit "
+        f"{MAX_ERROR_DEG:g}); record more rests in more attitudes, spread over the sphere, with turns about all axes"
+    )
+    return Issue("too-uncertain", "fail", text, model.kind, error, MAX_ERROR_DEG)
 
 
 def _temperature(job: Job) -> float | None:

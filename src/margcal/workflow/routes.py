@@ -23,15 +23,18 @@ from margcal.methods.coverage import distinct_directions
 from margcal.methods.joint import Gyro, JointFit, Priors, Triad, joint_fit
 from margcal.methods.levelled import level_prior
 from margcal.methods.preintegration import integrate, pad
+from margcal.methods.uncertainty import expected_error
 from margcal.workflow import attitudes as att
 from margcal.workflow.job import Job, Solved
 from margcal.workflow.turns import (
     along_turns,
+    check_full_turns,
     gyro_rest,
     need_turns,
     nominal_gyro,
     not_full,
     usable_turns,
+    with_nominal,
     without_full_turns,
 )
 
@@ -50,6 +53,9 @@ MAGNITUDE_SOLVERS: dict[str, Callable[..., Fit]] = {
 }
 
 
+GOOD_ENOUGH_DEG = 0.5
+"""Expected error up to which nobody looks for a fit with fewer parameters."""
+
 GYRO_SOLVERS = ("gauss-newton", "ukf")
 
 
@@ -65,7 +71,7 @@ def known(job: Job) -> Solved:
     if job.wants("mag"):
         solved.attempt("mag", lambda: _poses(job, "mag", R, usable))
     if job.wants("gyr"):
-        solved.attempt("gyr", lambda: _gyr_known(job, R, usable, solved))
+        solved.attempt("gyr", lambda: _gyr_known(job, R, usable))
     for kind, fit in solved.fits.items():
         if fit.u is not None:
             solved.vectors[kind] = fit.u
@@ -74,6 +80,7 @@ def known(job: Job) -> Solved:
     if job.options.pose_method == "gls-ml" and job.options.gyro_method == "gauss-newton":
         vertical = job.options.level_sd if job.attitudes.level else None
         _jointly(job, solved, usable_turns(job, usable), Priors(R0=R, vertical_sd=vertical), free_up=True)
+    check_full_turns(job, solved)
     return solved
 
 
@@ -104,7 +111,7 @@ def _level(job: Job, up: Array) -> Fit:
     return level_prior(y[keep], up[index[keep]], job.options.gravity, job.options.level_sd, **job.as_named("acc"))
 
 
-def _gyr_known(job: Job, R: Array, usable: Array, solved: Solved) -> Fit:
+def _gyr_known(job: Job, R: Array, usable: Array) -> Fit:
     turns = usable_turns(job, usable)
     need_turns(turns)
     bias, spread, sd = gyro_rest(job)
@@ -117,10 +124,8 @@ def _gyr_known(job: Job, R: Array, usable: Array, solved: Solved) -> Fit:
         turns, dR, H0=nominal_gyro(job), bias_prior=(bias, spread), sd=sd, raw_unit=job.raw_unit("gyr")
     )
     return without_full_turns(
-        job,
         turns,
         fit,
-        solved,
         lambda kept: gyroscope.gauss_newton(
             kept,
             gyroscope.known_rotations(R, kept),
@@ -153,22 +158,39 @@ def free(job: Job) -> Solved:
 
 
 def _acc_free(job: Job, solved: Solved) -> Fit:
+    """Nine parameters where the directions carry them, else bias and scale factors; the more certain of the two."""
     y, _ = job.readings("acc")
+    nine = six = None
     try:
-        return by_magnitude.triangular(y, job.options.gravity, **job.as_named("acc"))
+        nine = by_magnitude.triangular(y, job.options.gravity, **job.as_named("acc"))
+        if _acc_error(job, nine) <= GOOD_ENOUGH_DEG:
+            return nine
     except DataError as error:
-        first = error
+        reason = error
     try:
-        fit = by_magnitude.bias_and_scale(y, job.options.gravity, **job.as_named("acc"))
+        six = by_magnitude.bias_and_scale(y, job.options.gravity, **job.as_named("acc"))
     except DataError:
-        raise first from None
-    n = distinct_directions(y)
-    text = (
-        f"accelerometer: {n} distinct directions carry bias and scale factors only, not the angles between its "
-        f"axes (10 are needed); record rests in at least {10 - n} more directions, such as edges and corners up"
+        if nine is None:
+            raise reason from None
+    if six is None or (nine is not None and _acc_error(job, nine) <= _acc_error(job, six)):
+        assert nine is not None
+        return nine
+    n, error = distinct_directions(y), _acc_error(job, six)
+    than = (
+        "" if nine is None else f" (expected error {_acc_error(job, nine):.1f} degrees with them, {error:.1f} without)"
     )
-    solved.issues.append(Issue("bias-and-scale-only", "warn", text, "acc", float(n), 10.0))
-    return fit
+    text = (
+        f"accelerometer: {len(y)} rests in {n} directions carry bias and scale factors only, not the angles between "
+        f"its axes{than}; record five or more rests in new directions, edges and corners up too"
+    )
+    solved.issues.append(Issue("bias-and-scale-only", "warn", text, "acc", float(n), 15.0))
+    return six
+
+
+def _acc_error(job: Job, fit: Fit) -> float:
+    if fit.covariance is None or not fit.converged:
+        return float("inf")
+    return expected_error("acc", fit.model.H, fit.covariance, job.options.gravity).direction_deg
 
 
 def _with_gravity(job: Job, solved: Solved, priors: Priors, *, triangular: bool) -> Solved:
@@ -184,7 +206,8 @@ def _with_gravity(job: Job, solved: Solved, priors: Priors, *, triangular: bool)
     v[index] = acc.model.apply(y)
     turns = usable_turns(job, np.isfinite(v).all(axis=1))
     if job.wants("gyr"):
-        solved.attempt("gyr", lambda: _gyr_by_gravity(job, turns, v, acc, solved))
+        by_gravity = lambda: _gyr_by_gravity(job, turns, v, acc)  # noqa: E731
+        solved.attempt("gyr", lambda: with_nominal(job, acc.model, by_gravity, solved))
     R, piece = _attitudes_by_gyro(job, solved, v)
     if job.wants("mag"):
         fit = solved.attempt("mag", lambda: _mag_by_attitudes(job, R, piece, v))
@@ -193,6 +216,7 @@ def _with_gravity(job: Job, solved: Solved, priors: Priors, *, triangular: bool)
             solved.vectors["mag"] = fit.u
     solved.R = R
     _jointly(job, solved, turns, priors, triangular=triangular)
+    check_full_turns(job, solved)
     return solved
 
 
@@ -205,7 +229,7 @@ def _needs_accelerometer(kind: Kind, solved: Solved) -> None:
     solved.issues.append(Issue("needs-accelerometer", "fail", text, kind))
 
 
-def _gyr_by_gravity(job: Job, turns: list[Turn], v: Array, acc: Fit, solved: Solved) -> Fit:
+def _gyr_by_gravity(job: Job, turns: list[Turn], v: Array, acc: Fit) -> Fit:
     need_turns(turns)
     bias, spread, sd = gyro_rest(job)
 
@@ -224,7 +248,7 @@ def _gyr_by_gravity(job: Job, turns: list[Turn], v: Array, acc: Fit, solved: Sol
         )
 
     fit = fit_of(turns, nominal_gyro(job))
-    return without_full_turns(job, turns, fit, solved, lambda kept: fit_of(kept, fit.model.H))
+    return without_full_turns(turns, fit, lambda kept: fit_of(kept, fit.model.H))
 
 
 def _attitudes_by_gyro(job: Job, solved: Solved, v: Array) -> tuple[Array, Array]:
@@ -297,7 +321,7 @@ def _jointly(
     `triangular`: the accelerometer defines the frame; `free_up`: the vertical of the laboratory is estimated.
     """
     poses = ("acc", "mag")
-    whole = {k: f for k, f in solved.fits.items() if k == "gyr" or f.rank >= 9}
+    whole = {k: f for k, f in solved.fits.items() if f.rank >= 9}
     if not whole.keys() & set(poses) or (solved.fits.keys() - whole.keys()):
         return  # a sensor with bias and scale only has no attitudes to share
     triads = {k: triad_of(job, k, whole[k], solved, triangular, free_up) for k in poses if k in whole}

@@ -12,11 +12,12 @@ from margcal.core.types import Array, Fit, Issue, Recording
 from margcal.core.units import UNITS
 from margcal.methods.alignment import rotation_from_rates
 from margcal.methods.ellipsoid import adjusted_ellipsoid
+from margcal.methods.uncertainty import expected_error
 from margcal.workflow.job import NAMES, Job, Solved
 
 MIN_SWING_SAMPLES = 200
-MIN_FREE_RESTS_FOR_MAG = 10
-"""Below this many rests a swing, if there is one, says more about the magnetometer."""
+GOOD_ENOUGH_DEG = 0.5
+"""Expected error of the magnetometer from rests up to which a swing is not tried."""
 
 
 def swung(job: Job, solved: Solved | None = None) -> Solved:
@@ -36,9 +37,9 @@ def swung(job: Job, solved: Solved | None = None) -> Solved:
         except DataError as error:
             failure = error
             continue
-        spread = np.inf if fit.covariance is None else float(np.trace(fit.covariance[9:, 9:]))
-        if best is None or spread < best[0]:
-            best = (spread, recording, fit)
+        error = _error(job, fit)
+        if best is None or error < best[0]:
+            best = (error, recording, fit)
     if best is None:
         solved.attempt("mag", lambda: _no_swing(failure))
         return solved
@@ -123,17 +124,23 @@ def swing_only(job: Job) -> Solved:
 
 
 def try_swing(job: Job, solved: Solved) -> None:
-    """Where the rests carry the magnetometer badly or not at all, take it from continuous motion."""
-    if not job.wants("mag") or job.attitudes.mode not in ("free", "faces"):
+    """Where the rests carry the magnetometer badly or not at all, take it from continuous motion if that is better."""
+    if not job.wants("mag"):
         return
-    y, _ = job.readings("mag")
-    if "mag" in solved.fits and len(y) >= MIN_FREE_RESTS_FOR_MAG:
+    have = _error(job, solved.fits.get("mag"))
+    if have <= GOOD_ENOUGH_DEG:
         return
     trial = swung(job, Solved(fits={k: f for k, f in solved.fits.items() if k != "mag"}))
-    if "mag" not in trial.fits:
+    if _error(job, trial.fits.get("mag")) >= have:
         return
     solved.issues[:] = [i for i in solved.issues if i.sensor != "mag"] + trial.issues
     solved.fits["mag"] = trial.fits["mag"]
     solved.sources |= trial.sources
     solved.delays |= trial.delays
     solved.vectors.pop("mag", None)
+
+
+def _error(job: Job, fit: Fit | None) -> float:
+    if fit is None or fit.covariance is None or not np.isfinite(fit.covariance).all():
+        return float("inf")
+    return expected_error("mag", fit.model.H, fit.covariance, job.options.magnitude["mag"]).direction_deg

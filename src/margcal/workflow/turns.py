@@ -6,17 +6,27 @@ from collections.abc import Callable
 
 import numpy as np
 
+from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit, Issue, SensorModel, Turn
 from margcal.core.units import UNITS
 from margcal.methods.gyro import mean_bias
 from margcal.methods.gyro_start import full_turns
 from margcal.methods.preintegration import along
+from margcal.methods.uncertainty import expected_error
 from margcal.workflow.job import Job, Solved
 from margcal.workflow.lint import clipped
 
 FULL_TURN_DEG = (345.0, 375.0)
 MIN_TURNS = 5
+FULL_TURN_TOLERANCE_DEG = 3.0
+"""How far from 360 degrees a full turn made by hand may end."""
+NOMINAL_GAIN_SD = 0.03
+"""Datasheet tolerance of a gyroscope's gain (consumer parts: 1-3 %), used where the turns do not tell it."""
+NOMINAL_CROSS_SD = 0.02
+"""The same of the entries off the diagonal: cross-axis sensitivity (2 % in the datasheets) and mounting."""
+MAX_FREE_ERROR_DEG = 1.0
+"""Expected error above which the turns alone are not trusted and the nominal gain is taken in."""
 
 
 def usable_turns(job: Job, usable: Array | None = None) -> list[Turn]:
@@ -64,23 +74,91 @@ def nominal_gyro(job: Job) -> Array | None:
     return None if factor is None else factor * np.eye(3)
 
 
-def without_full_turns(
-    job: Job, turns: list[Turn], fit: Fit, solved: Solved, refit: Callable[[list[Turn]], Fit]
-) -> Fit:
-    """Fit again without full turns, and report what angle they close to: a check that had no part in the fit."""
-    found = full_turns(turns, fit.model.H, fit.model.B, low_deg=FULL_TURN_DEG[0], high_deg=FULL_TURN_DEG[1])
-    rest = [t for i, t in enumerate(turns) if i not in set(found.index.tolist())]
-    if not len(found.index) or len(rest) < MIN_TURNS:
-        return fit
-    again = refit(rest)
-    found = full_turns([turns[i] for i in found.index], again.model.H, again.model.B, low_deg=300, high_deg=420)
+def without_full_turns(turns: list[Turn], fit: Fit, refit: Callable[[list[Turn]], Fit]) -> Fit:
+    """Fit again without full turns: they tell one gain each and serve as a check that had no part in the fit."""
+    rest = not_full(turns, fit)
+    return fit if len(rest) == len(turns) or len(rest) < MIN_TURNS else refit(rest)
+
+
+def check_full_turns(job: Job, solved: Solved) -> None:
+    """Say at what angle the full turns close with the gyroscope as calibrated."""
+    fit = solved.fits.get("gyr")
+    turns = usable_turns(job)
+    if fit is None or not turns:
+        return
+    left_out = {id(t) for t in turns} - {id(t) for t in not_full(turns, fit)}
+    full = [t for t in turns if id(t) in left_out]
+    if not full or len(turns) - len(full) < MIN_TURNS:
+        return
+    found = full_turns(full, fit.model.H, fit.model.B, low_deg=300, high_deg=420)
     angles = ", ".join(f"{a:.1f}" for a in found.angle_deg)
-    text = (
-        f"gyroscope: {len(found.index)} full turns were kept out of the fit; calibrated they close at {angles} degrees"
-    )
     worst = float(np.max(np.abs(found.angle_deg - 360.0), initial=0.0))
-    solved.issues.append(Issue("full-turns", "note", text, "gyr", worst))
-    return again
+    text = f"gyroscope: {len(full)} full turns, kept out of the fit as a check, close at {angles} degrees"
+    if worst > FULL_TURN_TOLERANCE_DEG:
+        text += f"; {worst / 3.6:.1f} % is more than a turn made by hand misses by: record more turns about that axis"
+    level = "note" if worst <= FULL_TURN_TOLERANCE_DEG else "warn"
+    solved.issues.append(Issue("full-turns", level, text, "gyr", worst, FULL_TURN_TOLERANCE_DEG))
+
+
+def with_nominal(job: Job, acc: SensorModel, solve: Callable[[], Fit], solved: Solved) -> Fit:
+    """The gyroscope from its turns, and where these leave it open, helped by its nominal gain.
+
+    A gyroscope in rad/s or degrees per second comes with a gain that is right to a few per cent, in axes that
+    are the accelerometer's. Raw counts have no such thing: there the turns must do.
+
+    Raises
+    ------
+    DataError
+        If the turns are too few and the gain is unknown.
+    """
+    nominal = nominal_gyro(job)
+    try:
+        fit = solve()
+    except DataError:
+        if nominal is None:
+            raise
+        fit = None
+    if nominal is None or (fit is not None and _expected(fit) <= MAX_FREE_ERROR_DEG):
+        assert fit is not None
+        return fit
+    H0 = so3.polar(acc.H)[0] @ nominal
+    scale = np.cbrt(abs(np.linalg.det(H0)))
+    P = np.diag((scale * np.where(np.eye(3) > 0, NOMINAL_GAIN_SD, NOMINAL_CROSS_SD).ravel()) ** 2)
+    return _nominal_fit(job, solved, fit, H0, P)
+
+
+def _expected(fit: Fit) -> float:
+    if fit.covariance is None or not fit.converged:
+        return float("inf")
+    return expected_error("gyr", fit.model.H, fit.covariance, 1.0).direction_deg
+
+
+def _nominal_fit(job: Job, solved: Solved, fit: Fit | None, H0: Array, P: Array) -> Fit:
+    """Least squares of the turns' H and the nominal one, both with their covariances; bias from the rests."""
+    bias, spread, _ = gyro_rest(job)
+    C = np.zeros((12, 12))
+    C[9:, 9:] = spread
+    usable = fit is not None and fit.converged and fit.covariance is not None
+    if usable:
+        assert fit is not None and fit.covariance is not None
+        gain = P @ np.linalg.inv(P + fit.covariance[:9, :9])
+        H = H0 + (gain @ (fit.model.H - H0).ravel()).reshape(3, 3)
+        C[:9, :9] = P - gain @ P
+        residual, what = np.asarray(fit.residual), f"{len(np.asarray(fit.residual))} turns and the nominal gain"
+    else:
+        H, residual, what = H0, np.zeros(1), "its nominal gain; only the bias was measured"
+        C[:9, :9] = P
+    C = (C + C.T) / 2
+    text = (
+        f"gyroscope: the turns do not carry it alone; it is calibrated from {what} "
+        f"(taken as right to {NOMINAL_GAIN_SD * 100:.0f} %). Record ten or more turns of 60 to 270 degrees about "
+        "all axes between rests"
+    )
+    solved.issues.append(
+        Issue("nominal-gain", "warn", text, "gyr", _expected(fit) if fit else None, MAX_FREE_ERROR_DEG)
+    )
+    model = SensorModel("gyr", H, bias, covariance=C, raw_unit=job.raw_unit("gyr"), method="nominal-gain")
+    return Fit(model, residual, float(residual @ residual), "nominal-gain", covariance=C, rank=3)
 
 
 def not_full(turns: list[Turn], fit: Fit) -> list[Turn]:

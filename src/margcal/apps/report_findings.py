@@ -1,0 +1,108 @@
+"""Findings (issues with their levels) and provenance (files, settings, program, methods)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from margcal.apps.report_text import NAMES, esc, number, plural, table
+from margcal.core.types import Calibration, Issue
+
+LEVELS = {"fail": "Failure", "warn": "Warning", "note": "Note"}
+_SETTINGS = {
+    "poses": "Attitudes asked for",
+    "attitudes": "Attitudes taken",
+    "attitudes_text": "How sure",
+    "sensors": "Sensors asked for",
+    "method": "Method asked for",
+    "gravity": "Gravity, m/s²",
+    "field_uT": "Magnetic field, µT",
+    "at": "Place (latitude, longitude, year)",
+    "level": "Level-table prior",
+    "level_sd_deg": "Tilt of the table, sd in °",
+    "units": "Units",
+    "sources": "Taken from",
+}
+_HIDDEN = {"attitudes_figures"}
+MAX_ISSUES = 300
+
+
+def findings(calibration: Calibration) -> str:
+    """The issues, the gravest first."""
+    order = list(LEVELS)
+    issues = sorted(calibration.issues, key=lambda i: order.index(i.level) if i.level in LEVELS else 9)
+    if not issues:
+        return '<p class="quiet">Nothing to report.</p>'
+    more = len(issues) - MAX_ISSUES
+    rest = f'<li class="note">{plural(more, "further finding")} not listed.</li>' if more > 0 else ""
+    return f'<ul class="findings">{"".join(map(_finding, issues[:MAX_ISSUES]))}{rest}</ul>'
+
+
+def _finding(issue: Issue) -> str:
+    figures = ""
+    if issue.value is not None:
+        figures = f" · {number(issue.value, 4)}"
+        figures += f", limit {number(issue.limit, 4)}" if issue.limit is not None else ""
+    sensor = f" · {NAMES[issue.sensor]}" if issue.sensor in NAMES else ""
+    level = issue.level if issue.level in LEVELS else "note"
+    return (
+        f'<li class="{level}"><span class="level">{LEVELS[level]}</span><div><p>{_sentence(issue.text)}</p>'
+        f'<p class="code">{esc(issue.code, 80)}{sensor}{figures}</p></div></li>'
+    )
+
+
+def _sentence(text: str) -> str:
+    return esc(text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else "."), 1200)
+
+
+def provenance(calibration: Calibration) -> str:
+    """Files with their hashes, settings, methods with their sources, program."""
+    return "".join([_files(calibration), _methods(calibration), _settings(calibration.settings), _program(calibration)])
+
+
+def _files(calibration: Calibration) -> str:
+    if not calibration.files:
+        return '<p class="quiet">The readings came from no file, or the calibration does not name it.</p>'
+    rows = [[esc(name, 200), f'<code class="hash">{esc(digest, 64)}</code>'] for name, digest in calibration.files]
+    return table(["File", "SHA-256"], rows, "files")
+
+
+def _methods(calibration: Calibration) -> str:
+    rows = []
+    for kind, model in calibration.models.items():
+        fit = calibration.fits.get(kind)
+        source = esc(fit.cites, 300) if fit is not None else ""
+        rows.append([NAMES[kind].capitalize(), esc(model.method, 60) or "–", source or "–"])
+    return table(["Sensor", "Method", "Source"], rows, "methods") if rows else ""
+
+
+def _settings(settings: Mapping[str, Any]) -> str:
+    rows = [
+        [_SETTINGS.get(name) or esc(name, 60), esc(_plain(value), 600)]
+        for name, value in settings.items()
+        if name not in _HIDDEN and value not in (None, "", [], {})
+    ]
+    return table(["Setting", "Value"], rows, "settings") if rows else ""
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return number(value, 8)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k} {_plain(v)}" for k, v in value.items())
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return ", ".join(map(_plain, value))
+    return str(value)
+
+
+def _program(calibration: Calibration) -> str:
+    parts = [esc(calibration.program, 80) if calibration.program else "margcal"]
+    if calibration.created:
+        parts.append(esc(calibration.created, 40))
+    return (
+        f'<p class="program">{" · ".join(parts)}</p>'
+        '<p class="program">Z-TIE: Zhang, IEEE Trans. Ind. Electron. 62(6), 2015, doi 10.1109/TIE.2014.2375258. '
+        "ZY-TBME: Zhang and Yang, IEEE Trans. Biomed. Eng. 62(2), 2015, doi 10.1109/TBME.2014.2360335.</p>"
+    )

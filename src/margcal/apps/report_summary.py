@@ -1,0 +1,102 @@
+"""The top of the page: the verdict in a sentence, and a card with the decisive figures of each sensor."""
+
+from __future__ import annotations
+
+from margcal.apps.report_data import residuals
+from margcal.apps.report_text import NAMES, esc, fixed, listing, number, plural
+from margcal.core.types import Calibration, Kind, SensorModel
+
+FRAMES = {
+    "housing": "the axes of the housing",
+    "marker": "the axes of the marker body",
+    "acc-triangular": "the accelerometer's own axes",
+    "gyr-symmetric": "the axes in which the gyroscope's matrix is symmetric",
+}
+VERDICTS = {"pass": "Passed", "warn": "Passed with warnings", "fail": "Failed"}
+
+
+def masthead(calibration: Calibration) -> str:
+    """Name, sentence and cards."""
+    device = calibration.device
+    cards = "".join(_card(calibration, kind, model) for kind, model in calibration.models.items())
+    when = _date(calibration.created)
+    return (
+        f'<div class="strip"><span class="brand">margcal</span><span>Calibration report</span>{when}</div>'
+        f"<h1>{esc(device, 120) if device else 'Sensor node'}</h1>"
+        f'<p class="verdict">{_chip(calibration)}{sentence(calibration)}</p>'
+        f'<div class="cards">{cards}</div>'
+    )
+
+
+def _date(created: str | None) -> str:
+    return f'<time class="date">{esc(created, 40)[:16].replace("T", " ")}</time>' if created else ""
+
+
+def _chip(calibration: Calibration) -> str:
+    verdict = calibration.verdict
+    return f'<strong class="chip {verdict}">{VERDICTS[verdict]}</strong> ' if verdict in VERDICTS else ""
+
+
+def sentence(calibration: Calibration) -> str:
+    """What was calibrated and how good it is, in a sentence or two (HTML)."""
+    models = calibration.models
+    if not models:
+        return "No sensor could be calibrated; the findings below say why and what to record next."
+    names = listing(NAMES[k] for k in models).capitalize()
+    text = f"{names} {'is' if len(models) == 1 else 'are'} calibrated{_from_what(calibration)}, {_frame(calibration)}."
+    known = [(k, m.expected_error_deg) for k, m in models.items() if m.expected_error_deg is not None]
+    if known:
+        kind, worst = max(known, key=lambda pair: pair[1])
+        each = "their directions are" if len(known) > 1 else f"the {NAMES[kind]}'s directions are"
+        most = " or better" if len(known) > 1 else ""
+        text += f" Expect {each} true to {degrees(worst)}{most}."
+    else:
+        text += " How true the directions are is not known: the calibration carries no covariance."
+    return text
+
+
+def _from_what(calibration: Calibration) -> str:
+    rests = max((m.n_poses or 0 for m in calibration.models.values()), default=0)
+    return f" from {plural(rests, 'rest')}" if rests else ""
+
+
+def _frame(calibration: Calibration) -> str:
+    frame = FRAMES.get(calibration.frame, f"the frame “{esc(calibration.frame, 60)}”")
+    return f"in one common frame: {frame}" if len(calibration.models) > 1 else f"in {frame}"
+
+
+def degrees(value: float | None) -> str:
+    """An angle with two significant digits, three where it begins with 1."""
+    if value is None:
+        return "–"
+    return f"{number(value, 3) if value >= 10 else fixed(value, 1 if value >= 3 else 2 if value >= 0.1 else 3)}°"
+
+
+def _card(calibration: Calibration, kind: Kind, model: SensorModel) -> str:
+    rows = [("Residual, rms", _residual(calibration, kind, model))]
+    if model.n_poses is not None:
+        rows.append(("Rests", str(model.n_poses)))
+    if model.method:
+        rows.append(("Method", esc(model.method, 40)))
+    details = "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in rows if v)
+    value = degrees(model.expected_error_deg)
+    caption = "expected direction error" if model.expected_error_deg is not None else "direction error not known"
+    return (
+        f'<article class="card"><h2>{NAMES[kind].capitalize()}</h2><p class="figure">{value}</p>'
+        f'<p class="caption">{caption}</p><dl>{details}</dl></article>'
+    )
+
+
+def _residual(calibration: Calibration, kind: Kind, model: SensorModel) -> str:
+    from margcal.apps.report_data import shown_unit
+
+    factor, unit = shown_unit(model)
+    found = residuals(calibration, kind)
+    if model.residual_rms is not None:
+        value = factor * model.residual_rms
+    elif found is not None:
+        value = found.rms
+    else:
+        return ""
+    space = "" if unit[0] == "°" else " "
+    return f"{number(value, 3)}{space}{unit}"

@@ -1,0 +1,149 @@
+"""Pictures of what was recorded: every sensor over time, rests shaded and numbered, knocks marked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from margcal.apps.report_svg import Scale, percent, plot_row, scale_of, stretched, tick_labels, trace
+from margcal.apps.report_text import NAMES, esc, fixed, plural, unit_words
+from margcal.core.types import Array, Calibration, Poses, Recording, Stream
+
+BINS = 900
+MAX_RECORDINGS = 8
+LANE, PANEL, SPACE, FOOT = 30.0, 104.0, 12.0, 24.0
+"""Heights in pixels: the lane of the rests, the panel of a sensor, the space between them, the time axis."""
+
+
+def timelines(calibration: Calibration) -> str:
+    """A picture for each recording."""
+    shown = [(i, r) for i, r in enumerate(calibration.recordings) if any(len(s.t) for s in r.streams.values())]
+    bins = max(250, BINS // max(1, len(shown[:MAX_RECORDINGS])))
+    parts = [_timeline(calibration, recording, index, bins) for index, recording in shown[:MAX_RECORDINGS]]
+    if len(shown) > MAX_RECORDINGS:
+        parts.append(f'<p class="note">{plural(len(shown) - MAX_RECORDINGS, "further recording")} not drawn.</p>')
+    return "".join(parts)
+
+
+def _span(recording: Recording) -> Scale:
+    ends = [(s.t[0], s.t[-1]) for s in recording.streams.values() if len(s.t)]
+    start, stop = float(min(a for a, _ in ends)), float(max(b for _, b in ends))
+    return Scale(start, stop if stop > start else start + 1.0)
+
+
+def _timeline(calibration: Calibration, recording: Recording, index: int, bins: int) -> str:
+    time = _span(recording)
+    streams = {k: s for k, s in recording.streams.items() if len(s.t)}
+    height = LANE + len(streams) * (PANEL + SPACE) + FOOT
+    mine = _rests_of(calibration.poses, index)
+    plot, labels = [_rests(calibration, mine, time, height - FOOT)], []
+    for row, (kind, stream) in enumerate(streams.items()):
+        top = LANE + row * (PANEL + SPACE)
+        ticks, curves = _panel(stream, time, top, bins)
+        labels.append(ticks)
+        plot.append(curves)
+        plot.append(f'<text class="panel-name" x="6" y="{top + 14:g}">{NAMES[kind]}, {unit_words(stream.unit)}</text>')
+    plot.append(_time_axis(time, height))
+    title = f"Readings of {esc(recording.source)} over time with {plural(len(mine), 'rest')}"
+    return (
+        f'<figure class="timeline">{plot_row("".join(labels), "".join(plot), height, title)}'
+        f"<figcaption>{_caption(calibration, recording, mine)}</figcaption></figure>"
+    )
+
+
+def _rests_of(poses: Poses | None, index: int) -> Array:
+    """Indices of the rests that lie in recording `index`."""
+    if poses is None:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(np.asarray(poses.recording, dtype=np.int64) == index)
+
+
+def _rests(calibration: Calibration, mine: Array, time: Scale, height: float) -> str:
+    poses = calibration.poses
+    if poses is None:
+        return ""
+    parts, last = [], {"wide": -1.0, "narrow": -1.0}
+    for i in mine.tolist():
+        a, b = float(time(poses.start[i])), float(time(poses.stop[i]))
+        knocked = int(poses.knocks[i])
+        title = f"rest {i + 1}: {fixed(poses.start[i] - time.low, 1)} to {fixed(poses.stop[i] - time.low, 1)} s"
+        title += f", a knock cut out ({plural(knocked, 'sample')})" if knocked else ""
+        parts.append(
+            f'<g><title>{title}</title><rect class="rest" x="{percent(a)}" width="{percent(b - a)}" y="{LANE:g}" '
+            f'height="{height - LANE:g}"/><rect class="rest-bar{" knocked" if knocked else ""}" x="{percent(a)}" '
+            f'width="{percent(b - a)}" y="{LANE - 8:g}" height="4"/></g>'
+        )
+        middle = (a + b) / 2
+        if knocked:
+            parts.append(_knock(middle))
+        parts.append(_rest_number(i + 1, middle, last))
+    parts += [_turn(poses, t.before, t.after, time) for t in calibration.turns if t.before in mine]
+    return "".join(parts)
+
+
+def _knock(x: float) -> str:
+    return (
+        f'<svg x="{percent(x)}" y="{LANE - 6:g}" overflow="visible"><path class="knock" d="M0-5L5 0 0 5-5 0z"/></svg>'
+    )
+
+
+def _rest_number(n: int, x: float, last: dict[str, float]) -> str:
+    """The number above a rest; left out where its neighbour is too near, more of them on a narrow screen."""
+    if x - last["wide"] < 0.021:
+        return ""
+    last["wide"] = x
+    narrow = x - last["narrow"] >= 0.06
+    if narrow:
+        last["narrow"] = x
+    return f'<text class="rest-no{"" if narrow else " thin"}" x="{percent(x)}" y="14">{n}</text>'
+
+
+def _turn(poses: Poses, before: int, after: int, time: Scale) -> str:
+    a, b = float(time(poses.stop[before])), float(time(poses.start[after]))
+    return f'<line class="turn" x1="{percent(a)}" x2="{percent(b)}" y1="{LANE - 6:g}" y2="{LANE - 6:g}"/>'
+
+
+def _panel(stream: Stream, time: Scale, top: float, bins: int) -> tuple[str, str]:
+    """Scale labels and curves of one sensor."""
+    value = scale_of(stream.y)
+    ticks = value.ticks(3)
+    labels, curves = [], [f'<rect class="frame" x="0" y="{top:g}" width="100%" height="{PANEL:g}"/>']
+    for v, text in zip(ticks, tick_labels(ticks)):
+        y = top + (1 - float(value(v))) * PANEL
+        labels.append(f'<text class="tick" x="52" y="{y + 3.5:.1f}" text-anchor="end">{text}</text>')
+        curves.append(f'<line class="grid" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
+    lines = "".join(
+        f'<path class="axis-{name}" d="{trace(stream.t, stream.y[:, k], time, value, bins)}"/>'
+        for k, name in enumerate("xyz")
+    )
+    return "".join(labels), "".join(curves) + stretched(lines, top, PANEL)
+
+
+def _time_axis(time: Scale, height: float) -> str:
+    since = Scale(0.0, time.high - time.low)
+    ticks = since.ticks(8)
+    parts = []
+    for i, (v, text) in enumerate(zip(ticks, tick_labels(ticks))):
+        x = float(since(v))
+        anchor = "start" if x < 0.02 else "end" if x > 0.98 else "middle"
+        thin = " thin" if i % 2 else ""
+        parts.append(
+            f'<line class="mark" x1="{percent(x)}" x2="{percent(x)}" y1="{LANE:g}" y2="{height - FOOT + 4:g}"/>'
+        )
+        parts.append(
+            f'<text class="tick{thin}" x="{percent(x)}" y="{height - 6:g}" text-anchor="{anchor}">'
+            f"{text}{' s' if i == 0 else ''}</text>"
+        )
+    return "".join(parts)
+
+
+def _caption(calibration: Calibration, recording: Recording, mine: Array) -> str:
+    rates = ", ".join(
+        f"{NAMES[k]} {plural(len(s.t), 'sample')} at {fixed(s.rate, 1 if s.rate < 1000 else 0)} Hz"
+        for k, s in recording.streams.items()
+        if len(s.t) > 1
+    )
+    knocks = calibration.poses is not None and bool(np.asarray(calibration.poses.knocks)[mine].any())
+    keys = "".join(f'<span class="key axis-{a}">{a}</span>' for a in "xyz")
+    keys += '<span class="key rest-key">rest</span>' if len(mine) else ""
+    keys += '<span class="key knock-key">knock, cut out</span>' if knocks else ""
+    return f'<span class="keys">{keys}</span><strong>{esc(recording.source)}</strong>: {rates}.'
