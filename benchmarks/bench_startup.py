@@ -3,7 +3,7 @@
     python benchmarks/bench_startup.py [--rounds 9] [--json]
 
 Targets: `margcal --help` at most 1.5 times `python -c "import numpy"`; `margcal calibrate` on the Xsens recording
-(23 MB of counts in memory, 37 rests), without report, at most 3 times a Python process that only reads the same
+(51175 rows, 37 rests), without report, at most 3 times a Python process that only reads the same
 file into NumPy. The candidates take turns (A B A B ...), each is a new process with one thread; CPU time is the
 process's own (user and system), wall time from start to end. Ratios are of the medians over the rounds, and of the
 minima. The recording is read from MARGCAL_DATA (default ../shared/data); without it that part is left out.

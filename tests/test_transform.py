@@ -62,7 +62,6 @@ def test_noise_free_recovery(solve, poses):
 
 
 @pytest.mark.parametrize("solve", [slsqp, interior_point, active_set])
-@pytest.mark.filterwarnings("ignore:delta_grad")
 def test_noise_free_recovery_by_optimisers(solve):
     R = random_poses(20, np.random.default_rng(2))
     fit = solve(readings(R), R, G, bias=B)

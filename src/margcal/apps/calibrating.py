@@ -56,7 +56,7 @@ def run(
     if as_json:
         print_json(calibration, written=written, exit_status=0 if failure is None else 3)
     else:
-        _show(calibration, written)
+        _show(calibration, written, failure is not None)
     if failure is not None:
         kept = "" if output is None or allow_fail else f"; {output} was not written (--allow-fail writes it)"
         screen.error(f"{str(failure).rstrip('.')}{kept}")
@@ -64,11 +64,11 @@ def run(
     return 0
 
 
-def _show(calibration: Calibration, written: dict[str, str]) -> None:
+def _show(calibration: Calibration, written: dict[str, str], failed: bool) -> None:
     from margcal.apps.printing import show_calibration, show_written
 
     show_calibration(calibration)
-    show_written(written)
+    show_written(written, hint=not failed)
 
 
 def read_one(path: str, reading: Mapping[str, Any]) -> Recording:

@@ -51,7 +51,7 @@ def show_attitudes(calibration: Calibration) -> None:
     screen.line(f"frame:     {calibration.frame}{': ' + frame if frame else ''}")
     if gravity := settings.get("gravity"):
         field = settings.get("field_uT")
-        strength = f"field {figure(field, 5)} uT" if field else "field unknown: the local field is 1 (norm)"
+        strength = f"field {field:.5g} uT" if field else "field unknown: the local field is 1 (norm)"
         screen.line(f"taken as:  gravity {gravity:.6g} m/s^2" + (f", {strength}" if calibration.mag else ""))
 
 
@@ -117,11 +117,12 @@ def show_issues(issues: Sequence[Issue]) -> None:
         screen.line(f"{issue.level}: {issue.text}", style=LEVEL_STYLE[issue.level])
 
 
-def show_written(written: dict[str, str]) -> None:
-    """Which files were written."""
+def show_written(written: dict[str, str], *, hint: bool = True) -> None:
+    """Which files were written; `hint`: where none was, how to have some."""
     screen.line()
     if not written:
-        screen.line("nothing was written (-o CAL.json keeps the calibration, --report REPORT.html shows it)")
+        how = " (-o CAL.json keeps the calibration, --report REPORT.html shows it)" if hint else ""
+        screen.line(f"nothing was written{how}")
     for what, path in written.items():
         screen.line(f"written: {path} ({what})")
 

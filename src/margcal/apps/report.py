@@ -106,12 +106,24 @@ def _recorded(calibration: Calibration) -> Section | None:
     return Section("recorded", "What was recorded", lead, body)
 
 
+ATTITUDES = {
+    "cube": "<strong>Cube.</strong> Each rest is one of the housing's 24 attitudes; the readings tell which.",
+    "faces": "<strong>Faces.</strong> One face of the housing is up at each rest, in any heading.",
+    "file": "<strong>Told.</strong> The attitudes were read from a file.",
+    "reference": "<strong>Reference.</strong> The attitudes were measured from outside, beside the readings.",
+    "free": "<strong>Free.</strong> Nothing was told of the attitudes; these are estimated, in the sensors' own frame.",
+    "swing": "<strong>Continuous motion.</strong>",
+}
+"""By what was taken (`settings['attitudes']`)."""
+
+
 def _attitudes(calibration: Calibration) -> Section | None:
     R, headings = attitudes(calibration)
     if R is None:
         return None
-    text = calibration.settings.get("attitudes_text")
-    said = f"<p>{esc(text)}.</p>" if isinstance(text, str) and text else ""
+    text, mode = calibration.settings.get("attitudes_text"), calibration.settings.get("attitudes")
+    said = ATTITUDES.get(mode, "") if isinstance(mode, str) else ""
+    said = f"<p>{said} {esc(text) + '.' if isinstance(text, str) and text else ''}</p>"
     if not headings:
         said += '<p class="note">Headings are not known: each box is drawn in the heading that turns it least.</p>'
     lead = f"{plural(len(R), 'rest')}, each seen from the same place. The arrow is up."
@@ -126,10 +138,7 @@ def _sphere(calibration: Calibration) -> Section | None:
         "A perfect sensor reads points on a sphere about zero, whichever way it lies. A real one reads an ellipsoid "
         "somewhere else. Calibration takes the one to the other."
     )
-    body = (
-        '<div id="viewer" hidden></div>'
-        f"<noscript>{still_pictures(data)}</noscript>{data_block('sphere-data', data)}"
-    )
+    body = f'<div id="viewer" hidden></div><noscript>{still_pictures(data)}</noscript>{data_block("sphere-data", data)}'
     return Section("sphere", "Before and after", lead, body)
 
 

@@ -13,7 +13,7 @@ MAX_DRAWN = 96
 HALF = np.array([0.60, 0.46, 0.30])
 """Half edges of the box: three different ones, so that its attitude can be told from its shape."""
 FACE_UP = math.cos(math.radians(12.0))
-SIZE, UNIT = 100.0, 40.0
+SIZE, UNIT = 100.0, 46.0
 """Edge of a picture, and pixels per unit of length."""
 
 _AZIMUTH, _ELEVATION = math.radians(-58.0), math.radians(26.0)
@@ -70,14 +70,13 @@ def _point(p: Array) -> str:
 def _screen(p: Array) -> Array:
     """Laboratory points (..., 3) to the picture (..., 2)."""
     q = p @ view().T
-    return np.stack([SIZE / 2 + UNIT * q[..., 0], SIZE * 0.60 - UNIT * q[..., 1]], axis=-1)
+    return np.stack([0.47 * SIZE + UNIT * q[..., 0], 0.53 * SIZE - UNIT * q[..., 1]], axis=-1)
 
 
 def _box(R: Array) -> str:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * HALF @ R.T
-    bottom, top = float(corners[:, 2].min()), float(corners[:, 2].max())
-    parts = [_shadow(corners, bottom), *(_face(R, *face) for face in _FACES), _up_arrow(top)]
-    return "".join(parts)
+    sides = (_face(R, *face) for face in _FACES)
+    return "".join([_shadow(corners, float(corners[:, 2].min())), *sides, _UP_ARROW])
 
 
 def _shadow(corners: Array, bottom: float) -> str:
@@ -121,10 +120,12 @@ def _face(R: Array, name: str, out: tuple, run: tuple, up: tuple) -> str:
 
 
 def _letters(name: str, centre: Array, run: Array, up: Array, room: float) -> str:
-    """The name of a side, lying in its plane."""
+    """The name of a side, lying in its plane, turned by quarters until it can be read."""
     c = _screen(centre)
-    x = _screen(centre + run) - c
-    y = c - _screen(centre + up)
+    quarters = [(run, up), (up, -run), (-run, -up), (-up, run)]
+    x, y = max(
+        ((_screen(centre + r) - c, c - _screen(centre + u)) for r, u in quarters), key=lambda v: v[0][0] + v[1][1]
+    )
     if abs(x[0] * y[1] - x[1] * y[0]) < 0.10 * UNIT**2:
         return ""  # seen too flat to be read
     s = 1.15 * room / 10
@@ -132,9 +133,4 @@ def _letters(name: str, centre: Array, run: Array, up: Array, room: float) -> st
     return f'<text class="letters axis-{name[-1]}" transform="matrix({m})" x="0" y="3.4">{name}</text>'
 
 
-def _up_arrow(top: float) -> str:
-    tail, tip = _screen(np.array([[0.0, 0.0, top + 0.10], [0.0, 0.0, top + 0.52]]))
-    return (
-        f'<path class="up" d="M{_point(tail)}L{_point(tip)}M{tip[0] - 3:.1f} {tip[1] + 4.5:.1f}'
-        f'L{_point(tip)}L{tip[0] + 3:.1f} {tip[1] + 4.5:.1f}"/>'
-    )
+_UP_ARROW = '<path class="up" d="M93 62V38M89.5 42.5L93 38L96.5 42.5"/>'

@@ -52,7 +52,9 @@ def _finding(issue: Issue) -> str:
 
 
 def _sentence(text: str) -> str:
-    return esc(text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else "."), 1200)
+    if text.startswith(tuple(NAMES.values())):  # a file's name stays as it is
+        text = text[:1].upper() + text[1:]
+    return esc(text + ("" if text[-1:] in ".!?" else "."), 1200)
 
 
 def provenance(calibration: Calibration) -> str:

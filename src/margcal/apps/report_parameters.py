@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from margcal.apps.report_text import decimals_for, esc, fixed, matrix, number, plus_minus, unit_words
+from margcal.apps.report_text import decimals_for, esc, fixed, matrix, number, per_unit, plus_minus, unit_words
 from margcal.core.errors import InputError
 from margcal.core.types import Array, SensorModel
 from margcal.methods.sensor_model import Description, describe
@@ -77,28 +77,37 @@ def lines(model: SensorModel) -> list[Line]:
     rows = flat.reshape(-1, 3)
     errors = np.full_like(rows, np.nan) if se is None else se.reshape(-1, 3)
     raw, unit, xyz = unit_words(model.raw_unit), unit_words(model.unit), ("x", "y", "z")
+    scale_unit = f"{raw} per {per_unit(model.unit)}"
     magnetic = model.kind == "mag"
     bias = ("Hard iron and bias", "Offset of the readings: what they are centred on, in raw units")
     bias = bias if magnetic else ("Bias", "What the sensor reads when there is nothing to sense")
     out = [
         Line(*bias, xyz, rows[0], raw, errors[0]),
-        Line("Scale factor", "Raw units for one calibrated unit", xyz, rows[1], f"{raw} per {unit}", errors[1]),
+        Line(
+            "Scale factor",
+            "Raw units for one calibrated unit",
+            xyz,
+            rows[1],
+            scale_unit,
+            errors[1],
+        ),
         Line(
             "Non-orthogonality",
             "How far two axes are from a right angle; positive where they lean together",
             ("x, y", "x, z", "y, z"),
             rows[2],
-            "°",
+            "degrees",
             errors[2],
         ),
-        Line("Mounting", _mounting_words(about, model), ("roll", "pitch", "yaw"), rows[3], "°", errors[3]),
+        Line("Mounting", _mounting_words(about, model), ("roll", "pitch", "yaw"), rows[3], "degrees", errors[3]),
     ]
     if magnetic:
         words = "The same offset as a field along the raw axes"
         out.insert(1, Line("Hard iron as a field", words, xyz, rows[4], unit, errors[4]))
         for k, axis in enumerate("xyz"):
-            words = "How iron nearby bends the field; the unit matrix is none" if k == 0 else ""
-            out.append(Line("Soft iron" if k == 0 else "", words, xyz, rows[5 + k], f"row {axis}", errors[5 + k]))
+            name = "Soft iron" if k == 0 else ""
+            words = "How iron nearby bends the field, a matrix; " if k == 0 else ""
+            out.append(Line(name, f"{words}row {axis}", xyz, rows[5 + k], "", errors[5 + k]))
     return out
 
 
@@ -120,26 +129,28 @@ def parameter_table(model: SensorModel) -> str:
         return f'<p class="note">Not told in words: {esc(error)}.</p>'
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="parameters of the {model.kind}">'
-        f'<table class="parameters"><tbody>{"".join(map(_row, rows))}</tbody></table></div>'
+        f'<table class="parameters" role="table"><tbody>{"".join(map(_row, rows))}</tbody></table></div>'
     )
 
 
 def _row(line: Line) -> str:
     cells = "".join(
-        f'<td><span class="axis">{name}</span>{plus_minus(float(v), float(s))}</td>'
+        f'<td role="cell"><span class="axis">{name}</span>{plus_minus(float(v), float(s))}</td>'
         for name, v, s in zip(line.columns, line.value, line.se)
     )
     about = f'<span class="meaning">{line.meaning}</span>' if line.meaning else ""
-    return f'<tr><th scope="row">{line.name}{about}</th>{cells}<td class="unit">{line.unit}</td></tr>'
+    unit = f'<td class="unit" role="cell">{line.unit}</td>'
+    return f'<tr role="row"><th scope="row" role="rowheader">{line.name}{about}</th>{cells}{unit}</tr>'
 
 
 def matrices(model: SensorModel) -> str:
     """H and B side by side."""
     unit, raw = unit_words(model.unit), unit_words(model.raw_unit)
+    one = per_unit(model.raw_unit)
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="H and B"><div class="matrices">'
         f'<span class="symbol">H</span><span class="equals">=</span>{matrix(model.H, "H")}'
-        f'<span class="unit">{unit} per {raw}</span>'
+        f'<span class="unit">{unit} per {one}</span>'
         f'<span class="symbol">B</span><span class="equals">=</span>{matrix(model.B, "B")}'
         f'<span class="unit">{raw}</span></div></div>'
     )

@@ -8,7 +8,7 @@ from margcal.apps.report_data import Residuals
 from margcal.apps.report_svg import Scale, percent, plot_row, tick_labels
 from margcal.apps.report_text import NAMES, esc, number
 
-HEIGHT, TOP, FOOT = 150.0, 20.0, 22.0
+HEIGHT, TOP, FOOT = 140.0, 10.0, 22.0
 MAX_BARS = 240
 OUTSTANDING = 3.0
 """A bar is marked as outstanding beyond this many times the rms of all others."""
@@ -16,8 +16,16 @@ OUTSTANDING = 3.0
 
 def residual_figure(found: Residuals) -> str:
     """The picture of one sensor's residuals with its caption."""
-    draw = _histogram if found.by == "sample" or len(found.value) > MAX_BARS else _bars
-    return f'<figure class="residual">{draw(found)}<figcaption>{_caption(found)}</figcaption></figure>'
+    draw = _bars if _as_bars(found) else _histogram
+    return f'<figure class="residual"><figcaption>{_caption(found)}</figcaption>{draw(found)}</figure>'
+
+
+def _as_bars(found: Residuals) -> bool:
+    return found.by != "sample" and len(found.value) <= MAX_BARS
+
+
+def _unit(found: Residuals) -> str:
+    return "degrees" if found.unit == "°" else esc(found.unit)
 
 
 def outstanding(found: Residuals) -> bool:
@@ -28,7 +36,9 @@ def outstanding(found: Residuals) -> bool:
 
 def _caption(found: Residuals) -> str:
     worst, name = found.value[found.worst], NAMES[found.kind]
-    text = f"<strong>{name.capitalize()}</strong>, {esc(found.unit)}: rms {number(found.rms, 3)}"
+    text = f"<strong>{name.capitalize()}</strong>, {_unit(found)}: rms {number(found.rms, 3)}"
+    if _as_bars(found):
+        text += " (dashed)"
     if found.by in ("rest", "turn"):
         text += f"; largest {number(worst, 3)} at {found.by} {found.labels[found.worst]}"
         text += ", which stands out from the others" if outstanding(found) else ""
@@ -92,17 +102,10 @@ def _bars(found: Residuals) -> str:
             f'<text class="tick{worst}{" thin" if thin else ""}" x="{percent(x)}" y="{HEIGHT - 6:g}" '
             f'text-anchor="middle">{found.labels[i]}</text>'
         )
-    plot.append(_rms_line(scale, found.rms))
-    title = f"Residual of the {NAMES[found.kind]} by {found.by}, in {esc(found.unit)}"
+    y = _y(scale, found.rms)
+    plot.append(f'<line class="rms" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
+    title = f"Residual of the {NAMES[found.kind]} by {found.by}, in {_unit(found)}"
     return plot_row("".join(labels), "".join(plot), HEIGHT, title)
-
-
-def _rms_line(scale: Scale, rms: float) -> str:
-    y = _y(scale, rms)
-    return (
-        f'<line class="rms" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>'
-        f'<text class="tick rms-name" x="100%" y="{y - 4:.1f}" text-anchor="end">rms {number(rms, 3)}</text>'
-    )
 
 
 def _histogram(found: Residuals) -> str:
@@ -116,15 +119,12 @@ def _histogram(found: Residuals) -> str:
     base = _y(scale, 0.0)
     for c, a, b in zip(count.tolist(), across(edges[:-1]).tolist(), across(edges[1:]).tolist()):
         y = _y(scale, c)
-        plot.append(
-            f'<rect class="bar" x="{percent(a)}" width="{percent((b - a) * 0.94)}" y="{y:.1f}" height="{base - y:.1f}"/>'
-        )
+        place = f'x="{percent(a)}" width="{percent((b - a) * 0.94)}"'
+        plot.append(f'<rect class="bar" {place} y="{y:.1f}" height="{base - y:.1f}"/>')
     ticks = across.ticks(6)
     for v, text in zip(ticks, tick_labels(ticks)):
         x = float(across(v))
         if 0.03 < x < 0.97:
-            plot.append(
-                f'<text class="tick" x="{percent(x)}" y="{HEIGHT - 6:g}" text-anchor="middle">{text}</text>'
-            )
-    title = f"Histogram of the {NAMES[found.kind]} residuals, in {esc(found.unit)}; samples on the vertical axis"
+            plot.append(f'<text class="tick" x="{percent(x)}" y="{HEIGHT - 6:g}" text-anchor="middle">{text}</text>')
+    title = f"Histogram of the {NAMES[found.kind]} residuals, in {_unit(found)}; samples on the vertical axis"
     return plot_row("".join(labels), "".join(plot), HEIGHT, title)

@@ -44,15 +44,22 @@ def sentence(calibration: Calibration) -> str:
         return "No sensor could be calibrated; the findings below say why and what to record next."
     names = listing(NAMES[k] for k in models).capitalize()
     text = f"{names} {'is' if len(models) == 1 else 'are'} calibrated{_from_what(calibration)}, {_frame(calibration)}."
-    known = [(k, m.expected_error_deg) for k, m in models.items() if m.expected_error_deg is not None]
-    if known:
-        kind, worst = max(known, key=lambda pair: pair[1])
-        each = "their directions are" if len(known) > 1 else f"the {NAMES[kind]}'s directions are"
-        most = " or better" if len(known) > 1 else ""
-        text += f" Expect {each} true to {degrees(worst)}{most}."
-    else:
-        text += " How true the directions are is not known: the calibration carries no covariance."
-    return text
+    return f"{text} {_how_good(calibration)}"
+
+
+def _how_good(calibration: Calibration) -> str:
+    models = calibration.models
+    known = {k: m.expected_error_deg for k, m in models.items() if m.expected_error_deg is not None}
+    if not known:
+        return "How true its directions are is not known: there is no covariance to tell it from."
+    within = f"within {degrees(max(known.values()))} rms"
+    if len(known) == len(models):
+        return f"Directions are expected to be true {within}{' for every sensor' if len(models) > 1 else ''}."
+    unknown = listing(NAMES[k] for k in models if k not in known)
+    return (
+        f"Directions of the {listing(NAMES[k] for k in known)} are expected to be true {within}; of the {unknown} "
+        "it is not known."
+    )
 
 
 def _from_what(calibration: Calibration) -> str:

@@ -31,11 +31,13 @@ class Scale:
             return (np.asarray(value, dtype=np.float64) - self.low) / (self.high - self.low)
 
     def ticks(self, n: int = 4) -> list[float]:
-        """About `n` round values within the scale."""
+        """About `n` round values within the scale, and at least three."""
         span = self.high - self.low
         if not (math.isfinite(span) and span > 0):
             return []
         step = nice_step(span / n)
+        if math.floor(self.high / step) - math.ceil(self.low / step) < 2:
+            step = nice_step(span / n / 2)
         first = math.ceil(self.low / step - 1e-9)
         last = math.floor(self.high / step + 1e-9)
         return [k * step for k in range(first, min(last, first + 50) + 1)]
@@ -147,9 +149,10 @@ def stretched(content: str, y: float, height: float) -> str:
     )
 
 
-def plot_row(labels: str, plot: str, height: float, title: str, extra: str = "") -> str:
+def plot_row(labels: str, plot: str, height: float, title: str) -> str:
     """Scale labels and plot side by side."""
     return (
-        f'<div class="plot {extra}"><svg class="ylabels" height="{height:g}" width="58" aria-hidden="true">{labels}</svg>'
+        '<div class="plot">'
+        f'<svg class="ylabels" height="{height:g}" width="58" aria-hidden="true">{labels}</svg>'
         f'<svg class="area" height="{height:g}" width="100%" role="img" aria-label="{title}">{plot}</svg></div>'
     )

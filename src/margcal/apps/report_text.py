@@ -46,6 +46,11 @@ def unit_words(unit: str) -> str:
     return esc(plain_unit(unit))
 
 
+def per_unit(unit: str) -> str:
+    """The same behind "per": one of it."""
+    return "count" if unit == "count" else unit_words(unit)
+
+
 def number(value: float | None, digits: int = 4) -> str:
     """`value` with so many significant digits, a true minus, and powers of ten where they save zeros."""
     if value is None or not math.isfinite(value):
@@ -53,7 +58,7 @@ def number(value: float | None, digits: int = 4) -> str:
     text = f"{value:.{digits}g}"
     if "e" in text or (value and not 1e-4 <= abs(value) < 1e7):
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}".replace("-", "−")
+        return f"{mantissa}×{power_of_ten(int(exponent))}".replace("-", "−")
     return text.replace("-", "−")
 
 
@@ -94,6 +99,10 @@ def listing(words: Iterable[str]) -> str:
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1] if words else ""
 
 
+def power_of_ten(exponent: int) -> str:
+    return f"10{str(exponent).translate(_SUPERSCRIPT)}"
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], label: str, kind: str = "") -> str:
     """A table of ready HTML cells in a box of its own that scrolls; the first cell of a row names it."""
     top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
@@ -107,10 +116,17 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], label: str, kind: 
     )
 
 
-def matrix(values: np.ndarray, label: str, digits: int = 7) -> str:
-    """A matrix (or column vector) in brackets."""
+def matrix(values: np.ndarray, label: str) -> str:
+    """A matrix (or column vector) in brackets, seven digits, with one power of ten before it where that helps."""
     rows = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if np.ndim(values) == 1:
         rows = rows.T
-    cells = "".join("<tr>" + "".join(f"<td>{number(v, digits)}</td>" for v in row) + "</tr>" for row in rows)
-    return f'<table class="matrix" aria-label="{esc(label)}"><tbody>{cells}</tbody></table>'
+    size = float(np.abs(rows).max())
+    power = math.floor(math.log10(size)) if size > 0 and math.isfinite(size) else 0
+    shown = power if power < -1 or power > 6 else 0
+    decimals = min(max(6 - (power - shown), 0), 9)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{fixed(v, decimals)}</td>" for v in row) + "</tr>" for row in rows / 10.0**shown
+    )
+    factor = f'<span class="factor">{power_of_ten(shown)} ×</span>' if shown else ""
+    return f'{factor}<table class="matrix" aria-label="{esc(label)}"><tbody>{body}</tbody></table>'

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.apps.report_svg import Scale, percent, plot_row, scale_of, stretched, tick_labels, trace
-from margcal.apps.report_text import NAMES, esc, fixed, plural, unit_words
-from margcal.core.types import Array, Calibration, Poses, Recording, Stream
+from margcal.apps.report_text import NAMES, esc, fixed, listing, plural, unit_words
+from margcal.core import so3
+from margcal.core.types import Calibration, Poses, Recording, Stream
 
 BINS = 900
 MAX_RECORDINGS = 8
-LANE, PANEL, SPACE, FOOT = 30.0, 104.0, 12.0, 24.0
-"""Heights in pixels: the lane of the rests, the panel of a sensor, the space between them, the time axis."""
+LANE, PANEL, SPACE, FOOT = 30.0, 104.0, 26.0, 24.0
+"""Heights in pixels: lane of the rests, panel of a sensor, room above it for its name, time axis."""
 
 
 def timelines(calibration: Calibration) -> str:
@@ -22,6 +24,9 @@ def timelines(calibration: Calibration) -> str:
     if len(shown) > MAX_RECORDINGS:
         parts.append(f'<p class="note">{plural(len(shown) - MAX_RECORDINGS, "further recording")} not drawn.</p>')
     return "".join(parts)
+
+
+Index = NDArray[np.intp]
 
 
 def _span(recording: Recording) -> Scale:
@@ -35,14 +40,18 @@ def _timeline(calibration: Calibration, recording: Recording, index: int, bins: 
     streams = {k: s for k, s in recording.streams.items() if len(s.t)}
     height = LANE + len(streams) * (PANEL + SPACE) + FOOT
     mine = _rests_of(calibration.poses, index)
-    plot, labels = [_rests(calibration, mine, time, height - FOOT)], []
+    labels, frames, curves = [], [], []
     for row, (kind, stream) in enumerate(streams.items()):
-        top = LANE + row * (PANEL + SPACE)
-        ticks, curves = _panel(stream, time, top, bins)
+        top = LANE + SPACE + row * (PANEL + SPACE)
+        value = scale_of(stream.y)
+        ticks, frame = _frame(value, top)
         labels.append(ticks)
-        plot.append(curves)
-        plot.append(f'<text class="panel-name" x="6" y="{top + 14:g}">{NAMES[kind]}, {unit_words(stream.unit)}</text>')
-    plot.append(_time_axis(time, height))
+        frames.append(frame)
+        curves.append(_curves(stream, time, value, top, bins))
+        name = f"{NAMES[kind].capitalize()}, {unit_words(stream.unit)}"
+        curves.append(f'<text class="panel-name" x="0" y="{top - 7:g}">{name}</text>')
+    tops = [LANE + SPACE + row * (PANEL + SPACE) for row in range(len(streams))]
+    plot = [*frames, _time_axis(time, height), _rests(calibration, mine, time, tops), *curves]
     title = f"Readings of {esc(recording.source)} over time with {plural(len(mine), 'rest')}"
     return (
         f'<figure class="timeline">{plot_row("".join(labels), "".join(plot), height, title)}'
@@ -50,28 +59,28 @@ def _timeline(calibration: Calibration, recording: Recording, index: int, bins: 
     )
 
 
-def _rests_of(poses: Poses | None, index: int) -> Array:
+def _rests_of(poses: Poses | None, index: int) -> Index:
     """Indices of the rests that lie in recording `index`."""
     if poses is None:
-        return np.zeros(0, dtype=np.int64)
+        return np.zeros(0, dtype=np.intp)
     return np.flatnonzero(np.asarray(poses.recording, dtype=np.int64) == index)
 
 
-def _rests(calibration: Calibration, mine: Array, time: Scale, height: float) -> str:
+def _rests(calibration: Calibration, mine: Index, time: Scale, tops: list[float]) -> str:
     poses = calibration.poses
     if poses is None:
         return ""
     parts, last = [], {"wide": -1.0, "narrow": -1.0}
     for i in mine.tolist():
-        a, b = float(time(poses.start[i])), float(time(poses.stop[i]))
+        start, stop = float(poses.start[i]), float(poses.stop[i])
+        a, b = float(time(start)), float(time(stop))
         knocked = int(poses.knocks[i])
-        title = f"rest {i + 1}: {fixed(poses.start[i] - time.low, 1)} to {fixed(poses.stop[i] - time.low, 1)} s"
+        title = f"rest {i + 1}: {fixed(start - time.low, 1)} to {fixed(stop - time.low, 1)} s"
         title += f", a knock cut out ({plural(knocked, 'sample')})" if knocked else ""
-        parts.append(
-            f'<g><title>{title}</title><rect class="rest" x="{percent(a)}" width="{percent(b - a)}" y="{LANE:g}" '
-            f'height="{height - LANE:g}"/><rect class="rest-bar{" knocked" if knocked else ""}" x="{percent(a)}" '
-            f'width="{percent(b - a)}" y="{LANE - 8:g}" height="4"/></g>'
-        )
+        place = f'x="{percent(a)}" width="{percent(b - a)}"'
+        shades = "".join(f'<rect class="rest" {place} y="{top:g}" height="{PANEL:g}"/>' for top in tops)
+        bar = f'<rect class="rest-bar" {place} y="{LANE - 8:g}" height="4"/>'
+        parts.append(f"<g><title>{title}</title>{shades}{bar}</g>")
         middle = (a + b) / 2
         if knocked:
             parts.append(_knock(middle))
@@ -99,23 +108,30 @@ def _rest_number(n: int, x: float, last: dict[str, float]) -> str:
 
 def _turn(poses: Poses, before: int, after: int, time: Scale) -> str:
     a, b = float(time(poses.stop[before])), float(time(poses.start[after]))
-    return f'<line class="turn" x1="{percent(a)}" x2="{percent(b)}" y1="{LANE - 6:g}" y2="{LANE - 6:g}"/>'
+    title = f"turn from rest {before + 1} to rest {after + 1}"
+    if poses.R is not None and np.isfinite(poses.R[[before, after]]).all():
+        title += f": {fixed(float(np.degrees(so3.angle_between(poses.R[before], poses.R[after]))), 0)}° apart"
+    y = f"{LANE - 6:g}"
+    return f'<line class="turn" x1="{percent(a)}" x2="{percent(b)}" y1="{y}" y2="{y}"><title>{title}</title></line>'
 
 
-def _panel(stream: Stream, time: Scale, top: float, bins: int) -> tuple[str, str]:
-    """Scale labels and curves of one sensor."""
-    value = scale_of(stream.y)
-    ticks = value.ticks(3)
-    labels, curves = [], [f'<rect class="frame" x="0" y="{top:g}" width="100%" height="{PANEL:g}"/>']
+def _frame(value: Scale, top: float) -> tuple[str, str]:
+    """Scale labels and ground of one sensor's panel."""
+    ticks = value.ticks(4)
+    labels, ground = [], [f'<rect class="frame" x="0" y="{top:g}" width="100%" height="{PANEL:g}"/>']
     for v, text in zip(ticks, tick_labels(ticks)):
         y = top + (1 - float(value(v))) * PANEL
         labels.append(f'<text class="tick" x="52" y="{y + 3.5:.1f}" text-anchor="end">{text}</text>')
-        curves.append(f'<line class="grid" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
+        ground.append(f'<line class="grid" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
+    return "".join(labels), "".join(ground)
+
+
+def _curves(stream: Stream, time: Scale, value: Scale, top: float, bins: int) -> str:
     lines = "".join(
         f'<path class="axis-{name}" d="{trace(stream.t, stream.y[:, k], time, value, bins)}"/>'
         for k, name in enumerate("xyz")
     )
-    return "".join(labels), "".join(curves) + stretched(lines, top, PANEL)
+    return stretched(lines, top, PANEL)
 
 
 def _time_axis(time: Scale, height: float) -> str:
@@ -127,7 +143,7 @@ def _time_axis(time: Scale, height: float) -> str:
         anchor = "start" if x < 0.02 else "end" if x > 0.98 else "middle"
         thin = " thin" if i % 2 else ""
         parts.append(
-            f'<line class="mark" x1="{percent(x)}" x2="{percent(x)}" y1="{LANE:g}" y2="{height - FOOT + 4:g}"/>'
+            f'<line class="mark" x1="{percent(x)}" x2="{percent(x)}" y1="{height - FOOT:g}" y2="{height - 20:g}"/>'
         )
         parts.append(
             f'<text class="tick{thin}" x="{percent(x)}" y="{height - 6:g}" text-anchor="{anchor}">'
@@ -136,14 +152,19 @@ def _time_axis(time: Scale, height: float) -> str:
     return "".join(parts)
 
 
-def _caption(calibration: Calibration, recording: Recording, mine: Array) -> str:
-    rates = ", ".join(
-        f"{NAMES[k]} {plural(len(s.t), 'sample')} at {fixed(s.rate, 1 if s.rate < 1000 else 0)} Hz"
-        for k, s in recording.streams.items()
-        if len(s.t) > 1
-    )
-    knocks = calibration.poses is not None and bool(np.asarray(calibration.poses.knocks)[mine].any())
+def _caption(calibration: Calibration, recording: Recording, mine: Index) -> str:
+    knocks = calibration.poses is not None and any(calibration.poses.knocks[i] for i in mine.tolist())
     keys = "".join(f'<span class="key axis-{a}">{a}</span>' for a in "xyz")
     keys += '<span class="key rest-key">rest</span>' if len(mine) else ""
     keys += '<span class="key knock-key">knock, cut out</span>' if knocks else ""
-    return f'<span class="keys">{keys}</span><strong>{esc(recording.source)}</strong>: {rates}.'
+    return f'<span class="keys">{keys}</span><strong>{esc(recording.source)}</strong>: {_rates(recording)}.'
+
+
+def _rates(recording: Recording) -> str:
+    """``accelerometer and gyroscope 15451 samples at 100.0 Hz, magnetometer ...``"""
+    groups: dict[str, list[str]] = {}
+    for kind, s in recording.streams.items():
+        if len(s.t) > 1:
+            text = f"{plural(len(s.t), 'sample')} at {fixed(s.rate, 1 if s.rate < 1000 else 0)} Hz"
+            groups.setdefault(text, []).append(NAMES[kind])
+    return "; ".join(f"{listing(names)} {text}" for text, names in groups.items())

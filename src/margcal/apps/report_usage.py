@@ -29,7 +29,9 @@ def usage(calibration: Calibration) -> str:
 
 def _formula(calibration: Calibration) -> str:
     frame = FRAMES.get(calibration.frame, f"the frame “{esc(calibration.frame, 60)}”")
-    units = listing(f"{NAMES[k]} {unit_words(m.raw_unit)} to {unit_words(m.unit)}" for k, m in calibration.models.items())
+    units = listing(
+        f"{NAMES[k]} {unit_words(m.raw_unit)} to {unit_words(m.unit)}" for k, m in calibration.models.items()
+    )
     acc = " At rest the accelerometer then reads +g on the axis that points up." if calibration.acc else ""
     return (
         '<p class="formula"><var>u</var> = <var>H</var> (<var>y</var> − <var>B</var>)</p>'
@@ -78,14 +80,15 @@ def _vector(values: list[str]) -> str:
 
 
 def _typical_reading(calibration: Calibration, model: SensorModel) -> Array | None:
-    """A reading to check by: the mean of the first rest, else what the sensed vector along z would give."""
+    """A reading to check by: the mean of the first rest, else what the sensed vector along z would give; of a
+    gyroscope that of an arbitrary rate."""
     poses = calibration.poses
-    y = None
-    if poses is not None and model.kind in poses.mean:
+    y = model.invert(np.array([0.5, -1.0, 2.0])) if model.kind == "gyr" else None
+    if y is None and poses is not None and model.kind in poses.mean:
         good = np.flatnonzero(np.isfinite(poses.mean[model.kind]).all(axis=1))
         y = poses.mean[model.kind][good[0]] if len(good) else None
     if y is None:
-        y = model.invert(np.array([0.0, 0.0, 1.0 if model.kind == "gyr" else magnitude(calibration, model)]))
+        y = model.invert(np.array([0.0, 0.0, magnitude(calibration, model)]))
     if not np.isfinite(y).all():
         return None
     places = decimals_for(float(np.linalg.norm(np.linalg.inv(model.H))) * 1e-3, 1) or 0

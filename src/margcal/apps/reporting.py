@@ -38,6 +38,9 @@ def run(
     if recordings:
         from margcal.apps.printing import show_residuals
 
-        show_residuals(shown)
+        if shown.fits:
+            show_residuals(shown)
+        else:
+            screen.line("no rests of a calibrated sensor in the recordings: nothing to hold the calibration against")
     screen.line(f"written: {output}")
     return 0

@@ -59,7 +59,7 @@ def _rich_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: Seq
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    drawn = Table(box=SIMPLE_HEAD, show_header=any(header), pad_edge=False, header_style="bold")
+    drawn = Table(box=SIMPLE_HEAD, show_header=any(header), show_edge=False, header_style="bold")
     for k, name in enumerate(header):
         drawn.add_column(name, justify="right" if k in right else "left", no_wrap=k in right)
     for row in rows:

@@ -23,6 +23,7 @@ and with the sign of the result.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -179,17 +180,20 @@ def interior_point(
             jac=(lambda x: problem.constraint_gradient(x)[None]) if gradient else "2-point",  # type: ignore[arg-type]
             hess=BFGS(),
         )
-        return minimize(
-            problem.cost,
-            x0,
-            jac=problem.gradient if gradient else "2-point",
-            hess=BFGS(),
-            method="trust-constr",
-            constraints=[sphere],
-            bounds=Bounds(-bound, bound),  # type: ignore[arg-type]
-            callback=keep,
-            options={"gtol": tol, "xtol": tol * 1e-3, "barrier_tol": tol, "maxiter": max_iter},
-        )
+        with warnings.catch_warnings():
+            # its quasi-Newton update says so when a constraint's gradient stands still; nothing follows from it
+            warnings.filterwarnings("ignore", "delta_grad", UserWarning)
+            return minimize(
+                problem.cost,
+                x0,
+                jac=problem.gradient if gradient else "2-point",
+                hess=BFGS(),
+                method="trust-constr",
+                constraints=[sphere],
+                bounds=Bounds(-bound, bound),  # type: ignore[arg-type]
+                callback=keep,
+                options={"gtol": tol, "xtol": tol * 1e-3, "barrier_tol": tol, "maxiter": max_iter},
+            )
 
     return _solve(run, problem, B, start, "interior-point", As(kind, raw_unit, unit), y)
 

@@ -162,7 +162,7 @@ def gauss_newton(
     sd: ArrayLike | None = None,
     sigma_angle: float | None = None,
     max_iter: int = 20,
-    tol: float = 1e-3,
+    tol: float = 1e-2,
     raw_unit: str = "count",
 ) -> Fit:
     """H and B of the gyroscope from turns whose rotations are known: Gauss-Newton on SO(3).
@@ -229,7 +229,7 @@ def propagate_gravity(
     sd: ArrayLike | None = None,
     sigma_angle: float | None = None,
     max_iter: int = 30,
-    tol: float = 1e-3,
+    tol: float = 1e-2,
     raw_unit: str = "count",
 ) -> Fit:
     """H and B of the gyroscope from turns at whose ends directions are known in the node frame.

@@ -9,10 +9,13 @@ turn weighted by min(1, (4 sigma / misfit)^2), plus the prior on B.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.core import so3
 from margcal.core.errors import InputError
@@ -20,6 +23,7 @@ from margcal.core.types import Array
 from margcal.methods.preintegration import Preintegrated, TurnBatch, preintegrate
 
 _CUT = 4.0  # sigma of a turn's misfit beyond which its weight falls; 1 honest turn in 1000
+_THIN = 4  # samples put together in the first steps
 _FLOOR = 1e-12  # rad; keeps the weights finite on noise-free data
 
 # --- what is measured of a turn -----------------------------------------------------------------------------
@@ -46,11 +50,28 @@ def rotation_measure(known: Array) -> Measure:
     inverse = np.swapaxes(known, -1, -2)
 
     def measure(dR: Array) -> Misfit:
-        r = so3.log(inverse @ dR)
-        # log(exp(r) exp(d)) = r + J_r(r)^-1 d and J_r(r) = J_l(-r)
-        return Misfit(r, so3.left_jacobian_inverse(-r))
+        # log(exp(r) exp(d)) = r + J_r(r)^-1 d
+        return Misfit(*_log_and_jacobian(inverse @ dR))
 
     return measure
+
+
+def _log_and_jacobian(R: Array) -> tuple[Array, Array]:
+    """Rotation vectors r of a few rotations and J_r(r)^-1; as `so3.log` and faster, for angles below three radians."""
+    twist = R - np.swapaxes(R, -1, -2)
+    v = 0.5 * np.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]], axis=-1)
+    sine = np.sqrt(np.sum(v * v, axis=-1))
+    angle = np.arctan2(sine, 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1))
+    if np.any(angle > 3.0):
+        r = so3.log(R)
+    else:
+        r = v * (angle / np.where(sine > 0, sine, 1.0) + (sine == 0))[:, None]
+    # J_r(r)^-1 = I + [r]x / 2 + e [r]x^2
+    small = angle < 1e-3
+    a = np.where(small, 1.0, angle)
+    e = np.where(small, 1 / 12 + angle**2 / 720, (1 - 0.5 * a / np.tan(0.5 * a)) / a**2)
+    k = so3.skew(r)
+    return r, np.eye(3) + 0.5 * k + e[:, None, None] * (k @ k)
 
 
 def direction_measure(before: Array, after: Array) -> Measure:
@@ -85,6 +106,21 @@ class Problem:
     prior_root: Array | None  # inverse square root of the prior's covariance; None: B is held at prior_mean
     sd: Array | None
     sigma_angle: float | None  # None: estimated from the misfits
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """Turns that measure something."""
+        return self.dof > 0
+
+    @cached_property
+    def divisor(self) -> Array:
+        """`dof`, at least one."""
+        return np.maximum(self.dof, 1.0)
+
+    @cached_property
+    def typical(self) -> Array:
+        """Median of chi-square with `dof` degrees of freedom (Wilson-Hilferty)."""
+        return self.divisor * (1 - 2 / (9 * self.divisor)) ** 3
 
     @property
     def n_unknown(self) -> int:
@@ -121,43 +157,40 @@ def _median(x: Array) -> float:
     return float(0.5 * (ranked[(len(x) - 1) // 2] + ranked[len(x) // 2]))
 
 
-def _chi_median(dof: Array) -> Array:
-    """Median of chi-square (Wilson-Hilferty)."""
-    return dof * (1 - 2 / (9 * np.maximum(dof, 1))) ** 3
-
-
 def _weigh(problem: Problem, point: _Point) -> _Weights:
     """Covariance of each turn's misfit, the angle noise if unknown (moments, robustly), robust weights."""
-    gyro = point.misfit.G @ point.step.C @ np.swapaxes(point.misfit.G, -1, -2)
-    square = np.sum(point.misfit.r**2, axis=-1)
-    variance = np.trace(gyro, axis1=-2, axis2=-1)
-    used = problem.dof > 0
-    spare = max(float(problem.dof.sum()) - 9, 1.0) / max(float(problem.dof.sum()), 1.0)
-    dof = np.maximum(problem.dof, 1)
-    if problem.sigma_angle is not None:
-        angle2 = problem.sigma_angle**2
-    else:
-        # first the median, which one bad turn does not move; then the moment of the turns within the cut
-        total = _median((square / _chi_median(dof))[used]) / spare
-        near = np.minimum(1.0, (_CUT**2 * total) / np.maximum(square / dof, _FLOOR**2)) * used
-        total = float(near @ square / max(near @ problem.dof, 1)) / spare
-        angle2 = max(0.0, total - float(near @ variance / max(near @ problem.dof, 1)))
-    mean = variance / dof
+    G, r = point.misfit.G, point.misfit.r
+    gyro = G @ point.step.C @ np.swapaxes(G, -1, -2)
+    square, variance = np.einsum("ti,ti->t", r, r), np.einsum("tii->t", gyro)
+    mean = variance / problem.divisor
+    angle2 = _angle_variance(problem, square, variance) if problem.sigma_angle is None else problem.sigma_angle**2
     cov = gyro + (angle2 + _FLOOR**2 + 1e-8 * mean)[:, None, None] * np.eye(gyro.shape[-1])
     if point.misfit.blind is not None:
         # a share like that of the others: second-order terms must not be taken for precise measurements
         cov += mean[:, None, None] * point.misfit.blind
     root = np.linalg.inv(np.linalg.cholesky(cov))
-    size2 = np.sum(np.einsum("tij,tj->ti", root, point.misfit.r) ** 2, axis=-1)
+    white = (root @ r[..., None])[..., 0]
+    size2 = np.einsum("ti,ti->t", white, white)
     # the larger of the stated noise and what the middle of the turns shows: far from the solution all are large
-    unit = max(1.0, _median((size2 / _chi_median(dof))[used]))
-    limit = (_CUT + np.sqrt(np.maximum(dof - 3, 0))) ** 2 * unit
-    return _Weights(root, np.minimum(1.0, limit / np.maximum(size2, _FLOOR)) * used, float(np.sqrt(angle2)))
+    unit = max(1.0, _median((size2 / problem.typical)[problem.used]))
+    limit = (_CUT + np.sqrt(np.maximum(problem.divisor - 3, 0))) ** 2 * unit
+    return _Weights(root, np.minimum(1.0, limit / np.maximum(size2, _FLOOR)) * problem.used, math.sqrt(angle2))
+
+
+def _angle_variance(problem: Problem, square: Array, variance: Array) -> float:
+    """Variance of the attitudes or directions at the ends: what the misfits show beyond the readings' noise."""
+    total_dof = float(problem.dof.sum())
+    spare = max(total_dof - 9, 1.0) / max(total_dof, 1.0)
+    # first the median, which one bad turn does not move; then the moment of the turns within the cut
+    total = _median((square / problem.typical)[problem.used]) / spare
+    near = np.minimum(1.0, (_CUT**2 * total) / np.maximum(square / problem.divisor, _FLOOR**2)) * problem.used
+    n = max(float(near @ problem.dof), 1.0)
+    return max(0.0, float(near @ square) / n / spare - float(near @ variance) / n)
 
 
 def _cost(problem: Problem, point: _Point, weights: _Weights) -> float:
-    white = np.einsum("tij,tj->ti", weights.root, point.misfit.r)
-    cost = float(weights.robust @ np.sum(white**2, axis=-1))
+    white = (weights.root @ point.misfit.r[..., None])[..., 0]
+    cost = float(weights.robust @ np.einsum("ti,ti->t", white, white))
     if problem.prior_root is not None:
         cost += float(np.sum((problem.prior_root @ (point.B - problem.prior_mean)) ** 2))
     return cost
@@ -167,7 +200,7 @@ def _rows(problem: Problem, point: _Point, weights: _Weights) -> tuple[Array, Ar
     """Whitened rows A (n, 9 or 12) and misfit b (n,) of the linearised problem ``|A x + b|``."""
     root = weights.root * np.sqrt(weights.robust)[:, None, None]
     white = root @ point.misfit.G
-    b = np.einsum("tij,tj->ti", root, point.misfit.r).ravel()
+    b = (root @ point.misfit.r[..., None]).ravel()
     A_H = (white @ point.step.J_H).reshape(-1, 9)
     if problem.prior_root is None:
         return A_H, b
@@ -222,14 +255,40 @@ class Run:
         return _median(np.sqrt(np.sum(self.point.misfit.r**2, axis=-1)))
 
 
-def _descend(problem: Problem, H: Array, B: Array, max_iter: int, tol: float) -> Run:
+def _coarse_to_fine(problem: Problem, H: Array, B: Array, max_iter: int, tol: float) -> Run:
+    """Descend on turns thinned to a quarter of their samples as far as they are good for, then on all samples."""
+    if problem.batch.dt.shape[1] < 16 * _THIN:
+        return _descend(problem, H, B, max_iter, tol)
+    sd = None if problem.sd is None else problem.sd / np.sqrt(_THIN)
+    coarse = _descend(replace(problem, batch=_thinned(problem.batch), sd=sd), H, B, max_iter, tol, near=0.3)
+    fine = _descend(problem, coarse.point.H, coarse.point.B, max_iter, tol)
+    return replace(
+        fine, H=coarse.H[:-1] + fine.H, B=coarse.B[:-1] + fine.B, costs=coarse.costs[: len(coarse.H) - 1] + fine.costs
+    )
+
+
+def _thinned(batch: TurnBatch) -> TurnBatch:
+    """Every four readings replaced by their mean over the time that they stand for."""
+    n = batch.dt.shape[1] // _THIN
+    dt, y = batch.dt[:, : n * _THIN].reshape(-1, n, _THIN), batch.y[:, : n * _THIN].reshape(-1, n, _THIN, 3)
+    total = dt.sum(axis=-1)
+    weight = dt / np.where(total > 0, total, 1.0)[..., None]
+    weight[total == 0, 0] = 1.0
+    thinned = (weight[..., None, :] @ y)[..., 0, :]
+    # the samples that are over at the end stay as they are
+    rest = slice(n * _THIN, None)
+    return TurnBatch(np.concatenate([thinned, batch.y[:, rest]], 1), np.concatenate([total, batch.dt[:, rest]], 1))
+
+
+def _descend(problem: Problem, H: Array, B: Array, max_iter: int, tol: float, near: float = 0.0) -> Run:
+    """Iterate until the step is below `tol` standard errors, or below the share `near` of H."""
     point = _evaluate(problem, H, B)
     Hs, Bs, costs = [point.H], [point.B], []
     while True:
         weights = _weigh(problem, point)
         step = _solve_rows(*_rows(problem, point, weights))
         costs.append(_cost(problem, point, weights))
-        settled = step.sigmas < tol
+        settled = step.sigmas < tol or float(np.sum(step.x[:9] ** 2)) < near**2 * float(np.sum(point.H**2))
         if settled or len(Hs) > max_iter:
             # the last step is so small that the linear model is exact for it: no further integration
             point = _moved(point, step.x) if settled else point
@@ -276,7 +335,7 @@ def best_run(problem: Problem, starts: Iterable[Array], max_iter: int, tol: floa
     """Descend from one start after the other until one ends with misfits that noise can explain."""
     best: Run | None = None
     for H in starts:
-        run = _descend(problem, H, problem.prior_mean, max_iter, tol)
+        run = _coarse_to_fine(problem, H, problem.prior_mean, max_iter, tol)
         if best is None or run.typical < best.typical:
             best = run
         if best.typical <= misfit_limit(problem, best):

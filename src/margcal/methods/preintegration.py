@@ -184,14 +184,15 @@ def attitudes(E: Array) -> Array:
     P[..., :n, :, :] = E
     P[..., n:, :, :] = np.eye(3)
     # the place within the block comes first: every product then runs over contiguous memory
-    P = np.ascontiguousarray(np.moveaxis(P.reshape(*lead, blocks, size, 3, 3), -3, 0))
+    last = len(lead) + 1
+    P = np.ascontiguousarray(P.reshape(*lead, blocks, size, 3, 3).transpose(last, *range(last), -2, -1))
     for i in range(1, size):
         P[i] = P[i - 1] @ P[i]
     start = np.empty((*lead, blocks, 3, 3))
     start[..., 0, :, :] = np.eye(3)
     for b in range(1, blocks):
         start[..., b, :, :] = start[..., b - 1, :, :] @ P[-1, ..., b - 1, :, :]
-    return np.moveaxis(start @ P, 0, -3).reshape(*lead, blocks * size, 3, 3)[..., :n, :, :]
+    return (start @ P).transpose(*range(1, last + 1), 0, -2, -1).reshape(*lead, blocks * size, 3, 3)[..., :n, :, :]
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ def preintegrate(
     lead = J.shape[:-3]
     A = np.swapaxes(J.reshape(*lead, samples, 9), -1, -2)
     J_H = back @ (A @ z).reshape(*lead, 3, 9)
-    J_B = -back @ A.sum(axis=-1).reshape(*lead, 3, 3) @ H
+    J_B = -back @ (A @ np.ones(samples)).reshape(*lead, 3, 3) @ H
     C = np.zeros((*lead, 3, 3))
     if sd is not None:
         noise = H * (np.asarray(sd, dtype=np.float64) * np.ones(3))
@@ -279,7 +280,7 @@ def _in_chunks(y: Array, dt: Array, H: Array, B: Array, sd: ArrayLike | None) ->
 
 def _exp_and_jacobian(phi: Array) -> tuple[Array, Array]:
     """exp and left Jacobian of rotation vectors (..., 3), written out by components for speed (see `so3.exp`)."""
-    x, y, z = np.ascontiguousarray(np.moveaxis(phi, -1, 0))
+    x, y, z = phi[..., 0].copy(), phi[..., 1].copy(), phi[..., 2].copy()
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     s, c, d = so3.sinc_terms(np.sqrt(xx + yy + zz))
     E, J = np.empty((*x.shape, 3, 3)), np.empty((*x.shape, 3, 3))

@@ -102,12 +102,16 @@ def adjusted(z: Array, weights: Array) -> tuple[Array, float]:
 
 
 def _moments(z: Array, weights: Array) -> Array:
-    """Weighted means of x^a y^b z^c for a, b, c <= 4, (5, 5, 5)."""
+    """Weighted means of x^a y^b z^c, (5, 5, 5); those with a + b + c <= 4 are used."""
     powers = np.ones((3, 5, len(z)))
     for k in range(1, 5):
         powers[:, k] = powers[:, k - 1] * z.T
-    xy = (powers[0][:, None, :] * powers[1][None, :, :]).reshape(25, -1)
-    return ((xy * weights) @ powers[2].T).reshape(5, 5, 5) / weights.sum()
+    out = np.zeros((5, 5, 5))
+    weighted = powers[2] * weights
+    for a, b in itertools.product(range(5), repeat=2):
+        if a + b <= 4:
+            out[a, b] = weighted @ (powers[0, a] * powers[1, b])
+    return out / weights.sum()
 
 
 HERMITE = (

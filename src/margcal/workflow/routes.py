@@ -20,12 +20,13 @@ from margcal.methods import gyro as gyroscope
 from margcal.methods import gyro_paper, transform
 from margcal.methods.alignment import rotation_from_dip
 from margcal.methods.coverage import distinct_directions
+from margcal.methods.gyro_start import rotation_starts
 from margcal.methods.joint import Gyro, JointFit, Priors, Triad, joint_fit
 from margcal.methods.levelled import level_prior
 from margcal.methods.preintegration import integrate, pad
 from margcal.methods.uncertainty import expected_error
 from margcal.workflow import attitudes as att
-from margcal.workflow.job import Job, Solved
+from margcal.workflow.job import NAMES, Job, Solved
 from margcal.workflow.turns import (
     along_turns,
     check_full_turns,
@@ -72,6 +73,8 @@ def known(job: Job) -> Solved:
         solved.attempt("mag", lambda: _poses(job, "mag", R, usable))
     if job.wants("gyr"):
         solved.attempt("gyr", lambda: _gyr_known(job, R, usable))
+    if job.options.pose_method in MAGNITUDE_SOLVERS:
+        _own_frames(job, solved)
     for kind, fit in solved.fits.items():
         if fit.u is not None:
             solved.vectors[kind] = fit.u
@@ -92,6 +95,20 @@ def _poses(job: Job, kind: Kind, R: Array, usable: Array) -> Fit:
     if name in MAGNITUDE_SOLVERS:
         return MAGNITUDE_SOLVERS[name](y, magnitude, **job.as_named(kind))
     return POSE_SOLVERS[name](y, np.swapaxes(R[index], 1, 2), magnitude, **job.as_named(kind))
+
+
+def _own_frames(job: Job, solved: Solved) -> None:
+    """A fit by magnitude alone knows nothing of the housing: say so, and claim no direction."""
+    for kind in ("acc", "mag"):
+        fit = solved.fits.get(kind)
+        if fit is None:
+            continue
+        text = (
+            f"{NAMES[kind]}: method {job.options.pose_method} uses magnitudes only; H is in the sensor's own frame, not "
+            "in the housing's, and only magnitudes can be trusted; leave --method out to have all sensors in one frame"
+        )
+        solved.issues.append(Issue("own-frame", "warn", text, kind))
+        solved.fits[kind] = replace(fit, model=replace(fit.model, covariance=None), covariance=None)
 
 
 def _acc_known(job: Job, R: Array, usable: Array) -> Fit:
@@ -118,8 +135,9 @@ def _gyr_known(job: Job, R: Array, usable: Array) -> Fit:
     dR = gyroscope.known_rotations(R, turns)
     if job.options.gyro_method == "ukf":
         start = nominal_gyro(job)
-        fit = gyro_paper.ukf(turns, dR, H0=start, B0=bias, raw_unit=job.raw_unit("gyr"))
-        return fit
+        start = next(rotation_starts(turns, dR, bias)) if start is None else start
+        scale = float(np.cbrt(abs(np.linalg.det(start))))  # the filter is tuned for an H of order one
+        return gyro_paper.ukf(turns, dR, H0=start, B=bias, scale=scale, raw_unit=job.raw_unit("gyr"))
     fit = gyroscope.gauss_newton(
         turns, dR, H0=nominal_gyro(job), bias_prior=(bias, spread), sd=sd, raw_unit=job.raw_unit("gyr")
     )
@@ -215,9 +233,37 @@ def _with_gravity(job: Job, solved: Solved, priors: Priors, *, triangular: bool)
             R = _turned_to_field(job, fit, R, piece)
             solved.vectors["mag"] = fit.u
     solved.R = R
-    _jointly(job, solved, turns, priors, triangular=triangular)
+    if job.options.pose_method == "gls-ml" and job.options.gyro_method == "gauss-newton":
+        _jointly(job, solved, turns, priors, triangular=triangular)
+    else:
+        _say_what_was_taken(job, solved)
+    if acc.rank < 9:
+        _inherit_frame_error(job, solved, acc)
     check_full_turns(job, solved)
     return solved
+
+
+def _say_what_was_taken(job: Job, solved: Solved) -> None:
+    """Where nobody knows the attitudes the solvers for known ones have no place; nothing is swapped in silence."""
+    asked = {"acc": job.options.pose_method, "mag": job.options.pose_method, "gyr": job.options.gyro_method}
+    for kind, fit in solved.fits.items():
+        if fit.method in (asked[kind], "nominal-gain") or asked[kind] in ("gls-ml", "gauss-newton"):
+            continue
+        text = f"{NAMES[kind]}: method {asked[kind]} needs known attitudes; {fit.method} was taken"
+        solved.issues.append(Issue("method-replaced", "note", text, kind))
+
+
+def _inherit_frame_error(job: Job, solved: Solved, acc: Fit) -> None:
+    """Directions by an accelerometer whose axes are taken as orthogonal are no better than its own."""
+    sd = np.radians(_acc_error(job, acc)) / np.sqrt(2)  # about each axis
+    for kind in ("gyr", "mag"):
+        fit = solved.fits.get(kind)
+        if fit is None or fit.covariance is None or not np.isfinite(sd):
+            continue
+        J = np.stack([(so3.skew(axis) @ fit.model.H).ravel() for axis in np.eye(3)], axis=1)
+        C = fit.covariance.copy()
+        C[:9, :9] += sd**2 * J @ J.T
+        solved.fits[kind] = replace(fit, model=replace(fit.model, covariance=C), covariance=C)
 
 
 def _needs_accelerometer(kind: Kind, solved: Solved) -> None:
@@ -275,7 +321,8 @@ def _mag_by_attitudes(job: Job, R: Array, piece: Array, v: Array) -> Fit:
     magnitude = job.options.magnitude["mag"]
     if len(longest) >= 8:
         means = job.segmentation.poses.mean["mag"][longest]
-        return transform.one_step(means, np.swapaxes(R[longest], 1, 2), magnitude, **job.as_named("mag"))
+        solver = POSE_SOLVERS.get(job.options.pose_method, transform.one_step)
+        return solver(means, np.swapaxes(R[longest], 1, 2), magnitude, **job.as_named("mag"))
     return _mag_by_dip(job, y, v[index])
 
 
@@ -330,6 +377,12 @@ def _jointly(
     joint = joint_fit(triads, gyro, solved.R, priors)
     if joint.converged and all(np.isfinite(h).all() for h in joint.H.values()):
         adopt(solved, joint)
+        return
+    text = (
+        f"the joint fit of all sensors did not converge in {joint.n_iter} iterations; each sensor was calibrated by "
+        "itself, with larger errors: look at the residuals for a wrong attitude"
+    )
+    solved.issues.append(Issue("joint-not-converged", "warn", text))
 
 
 def _not_full(turns: list[Turn], fits: dict[Kind, Fit]) -> list[Turn]:

@@ -297,16 +297,20 @@ def _count(stream: Stream, span: tuple[float, float]) -> int:
 
 
 def _drifts(recording: Recording, floors: Floors, ratio: float, rest: _Rest) -> bool:
-    """Whether the accelerometer turns steadily through the "rest": a slow turn, not a rest.
+    """Whether accelerometer or magnetometer turns steadily through the "rest": a slow turn, not a rest.
 
-    Its means over the first and the last third must agree within half of the scatter that counts as still.
+    Its means over the first and the last third must agree within half of the scatter that counts as still. (The
+    magnetometer is asked only where it tells motion: a passing magnet is no turn.)
     """
-    if recording.acc is None:
-        return False
     third = (rest.stop - rest.start) / 3
-    first = _mean(recording.acc, (rest.start, rest.start + third))
-    last = _mean(recording.acc, (rest.stop - third, rest.stop))
-    return bool(np.linalg.norm(last - first) > 0.5 * ratio * floors["acc"])
+    for stream in _watched(recording):
+        if stream.kind == "gyr":
+            continue
+        first = _mean(stream, (rest.start, rest.start + third))
+        last = _mean(stream, (rest.stop - third, rest.stop))
+        if np.linalg.norm(last - first) > 0.5 * ratio * floors[stream.kind]:
+            return True
+    return False
 
 
 # --- what the sensors read ---------------------------------------------------------------------------

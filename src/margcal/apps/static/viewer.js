@@ -20,7 +20,7 @@ function margcalViewer(place, data) {
   const bar = element("div", { class: "viewer-bar" }, place);
   const tabs = element("div", { class: "group", role: "group", "aria-label": "Sensor" }, bar);
   const tabButtons = kinds.map(function (kind) {
-    const button = element("button", { type: "button" }, tabs, data[kind].name);
+    const button = element("button", { type: "button" }, tabs, data[kind].name.replace(/^./, function (c) { return c.toUpperCase(); }));
     button.addEventListener("click", function () { state.kind = kind; state.hover = null; prepare(); refresh(); });
     return button;
   });
