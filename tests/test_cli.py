@@ -19,6 +19,7 @@ from margcal.files.calfile import load
 from margcal.files.poses_table import read_poses
 from margcal.files.tables import read, write_table
 from margcal.methods.uncertainty import direction_errors_deg
+from margcal.workflow import routes
 from margcal.workflow.simulate import simulate, write_simulation
 
 MARGCAL = [sys.executable, "-m", "margcal.apps.cli"]
@@ -57,6 +58,13 @@ def test_help_names_the_verbs_and_version_the_version(capsys):
         assert f"\n  {verb} " in text
     assert run(["--version"]) == 0
     assert capsys.readouterr().out.startswith("margcal 0.")
+
+
+def test_help_names_every_solver(capsys):
+    assert run(["calibrate", "--help"]) == 0
+    text = capsys.readouterr().out
+    for name in (*routes.POSE_SOLVERS, *routes.MAGNITUDE_SOLVERS, *routes.GYRO_SOLVERS):
+        assert name in text
 
 
 @pytest.mark.parametrize(

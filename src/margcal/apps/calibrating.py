@@ -59,7 +59,7 @@ def run(
         _show(calibration, written, failure is not None)
     if failure is not None:
         kept = "" if output is None or allow_fail else f"; {output} was not written (--allow-fail writes it)"
-        screen.error(f"{str(failure).rstrip('.')}{kept}")
+        screen.error(f"{failure.rstrip('.')}{kept}")
         return 3
     return 0
 
@@ -102,21 +102,25 @@ def _poses(text: str) -> Any:
     return read_poses(text)
 
 
-def _calibrated(recordings: tuple[Recording, ...], asked: Mapping[str, Any]) -> tuple[Calibration, DataError | None]:
+def _calibrated(recordings: tuple[Recording, ...], asked: Mapping[str, Any]) -> tuple[Calibration, str | None]:
     """The calibration and why it failed; where it failed, what there is all the same."""
     from margcal.files.calfile import created_now
 
-    failure: DataError | None = None
+    failure: str | None = None
     with screen.progress("calibrating"):
         try:
             found = calibrate(*recordings, **asked)
         except DataError as refused:
-            failure = refused
+            failure = str(refused)
             try:
                 found = calibrate(*recordings, **asked, allow_fail=True)
             except DataError:  # refused before any sensor was looked at
                 issues = (*(i for r in recordings for i in r.issues), *refused.issues)
-                found = Calibration(device=asked.get("device"), issues=issues, recordings=recordings)
+                found = Calibration(
+                    device=asked.get("device"), verdict="fail", issues=issues, recordings=recordings
+                )
+    if failure is None and found.verdict == "fail":
+        failure = "the verdict is fail: " + "; ".join(i.text for i in found.issues if i.level == "fail")
     return replace(found, created=created_now()), failure
 
 

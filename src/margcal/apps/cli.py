@@ -151,7 +151,12 @@ def segment(recordings: tuple[str, ...], **given: Any) -> int:
     help="How the housing lay at the rests, or a table that says so.",
 )
 @_sensors
-@click.option("--method", metavar="NAME[,NAME]", help="Solver of accelerometer and magnetometer, of the gyroscope.")
+@click.option(
+    "--method",
+    metavar="NAME[,NAME]",
+    help="Accelerometer and magnetometer: gls-ml (default), one-step, alternation, eigen, svd, ellipsoid, triangular; "
+    "gyroscope: gauss-newton (default), ukf.",
+)
 @click.option("--gravity", type=float, metavar="G", help="Local gravity, m/s^2.  [default: 9.80665]")
 @click.option("--field", type=float, metavar="uT", help="Strength of the magnetic field.  [default: the unit]")
 @_at

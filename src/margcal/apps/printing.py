@@ -18,6 +18,7 @@ FRAMES = {
     "gyr-symmetric": "chosen so that the gyroscope's matrix is symmetric",
 }
 LEVEL_STYLE = {"note": "dim", "warn": "yellow", "fail": "red"}
+VERDICT_STYLE = {"pass": "green", "warn": "yellow", "fail": "red"}
 
 
 def figure(value: float | None, digits: int = 5) -> str:
@@ -31,7 +32,9 @@ def figure(value: float | None, digits: int = 5) -> str:
 
 
 def show_calibration(calibration: Calibration) -> None:
-    """Attitudes, the sensors with their quality and parameters, issues, H and B."""
+    """Verdict, attitudes, the sensors with their quality and parameters, issues, H and B."""
+    if calibration.verdict is not None:
+        screen.line(f"verdict:   {calibration.verdict}", style=VERDICT_STYLE[calibration.verdict])
     show_attitudes(calibration)
     if calibration.models:
         _show_quality(calibration)

@@ -44,13 +44,13 @@ def gallery(R: Array) -> str:
 
 
 def up_name(R: Array) -> str:
-    """Which way of the frame points up: ``+z up``, or the angle of the nearest axis from it."""
+    """Which way of the frame points up: ``+z up``, or the angle of the nearest axis from up."""
     up = R[2]
     k = int(np.argmax(np.abs(up)))
     name = f"{'+' if up[k] > 0 else '−'}{'xyz'[k]}"
     if abs(up[k]) >= FACE_UP:
         return f"{name} up"
-    return f"{name} {math.degrees(math.acos(min(1.0, abs(float(up[k]))))):.0f}° off up"
+    return f"{name} {math.degrees(math.acos(min(1.0, abs(float(up[k]))))):.0f}° from up"
 
 
 def _cell(n: int, R: Array) -> str:

@@ -22,9 +22,9 @@ def python_code(calibration: Calibration) -> str:
 def _python(model: SensorModel) -> str:
     k, name = model.kind.upper(), model.kind
     raw, unit = _comment(model.raw_unit), _comment(model.unit)
-    rows = (",\n" + " " * len(f"{k}_H = np.array([")).join(repr(row) for row in model.H.tolist())
+    rows = ",\n".join(f"    {row!r}" for row in model.H.tolist())
     return (
-        f"{k}_H = np.array([{rows}])  # {unit} per {raw}\n"
+        f"{k}_H = np.array([  # {unit} per {raw}\n{rows}])\n"
         f"{k}_B = np.array({model.B.tolist()!r})  # {raw}\n"
         f"{name} = ({name}_raw - {k}_B) @ {k}_H.T  # {name}_raw: (3,) or (N, 3) in {raw}; {name}: {unit}"
     )
@@ -37,16 +37,15 @@ def c_code(calibration: Calibration) -> str:
 
 def _floats(values: np.ndarray) -> str:
     """Numbers of C, a row of a matrix to the line."""
-    rows = [", ".join(f"{np.float32(v)!s}f" for v in row) for row in np.atleast_2d(values)]
-    return (",\n" + " " * len("static const float ACC_H[9] = {")).join(rows)
+    return ",\n".join("    " + ", ".join(f"{np.float32(v)!s}f" for v in row) for row in np.atleast_2d(values))
 
 
 def _c(model: SensorModel) -> str:
     k, name = model.kind.upper(), model.kind
     return (
         f"// {_comment(model.unit)} from {_comment(model.raw_unit)}, H row by row\n"
-        f"static const float {k}_H[9] = {{{_floats(model.H)}}},\n"
-        f"                   {k}_B[3] = {{{_floats(model.B)}}};\n"
+        f"static const float {k}_H[9] = {{\n{_floats(model.H)}}},\n"
+        f"{k}_B[3] = {{{_floats(model.B).strip()}}};\n"
         f"static inline void margcal_{name}(const float y[3], float u[3]) {{\n"
         f"    const float d[3] = {{y[0] - {k}_B[0], y[1] - {k}_B[1], y[2] - {k}_B[2]}};\n"
         f"    for (int i = 0; i < 3; i++) u[i] = {k}_H[3*i]*d[0] + {k}_H[3*i+1]*d[1] + {k}_H[3*i+2]*d[2];\n"

@@ -52,7 +52,8 @@ def _finding(issue: Issue) -> str:
 
 
 def _sentence(text: str) -> str:
-    if text.startswith(tuple(NAMES.values())):  # a file's name stays as it is
+    first = text.partition(" ")[0]
+    if first.isalpha() or first.rstrip(":") in NAMES.values():  # a file's name stays as it is
         text = text[:1].upper() + text[1:]
     return esc(text + ("" if text[-1:] in ".!?" else "."), 1200)
 

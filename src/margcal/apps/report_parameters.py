@@ -149,10 +149,10 @@ def matrices(model: SensorModel) -> str:
     one = per_unit(model.raw_unit)
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="H and B"><div class="matrices">'
-        f'<span class="symbol">H</span><span class="equals">=</span>{matrix(model.H, "H")}'
-        f'<span class="unit">{unit} per {one}</span>'
-        f'<span class="symbol">B</span><span class="equals">=</span>{matrix(model.B, "B")}'
-        f'<span class="unit">{raw}</span></div></div>'
+        f'<span class="group"><span class="symbol">H</span> = {matrix(model.H, "H")}'
+        f'<span class="unit">{unit} per {one}</span></span>'
+        f'<span class="group"><span class="symbol">B</span> = {matrix(model.B, "B")}'
+        f'<span class="unit">{raw}</span></span></div></div>'
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.apps.report_attitudes import view
 from margcal.apps.report_data import magnitude
@@ -33,7 +34,9 @@ def sphere_data(calibration: Calibration) -> dict[str, Any]:
     return out
 
 
-def _view_of(calibration: Calibration, model: SensorModel, rests: Array, numbers: Array, samples: Array) -> dict:
+def _view_of(
+    calibration: Calibration, model: SensorModel, rests: Array, numbers: NDArray[np.intp], samples: Array
+) -> dict:
     length = magnitude(calibration, model)
     radius = length / abs(np.linalg.det(model.H)) ** (1 / 3)
     centred = bool(np.linalg.norm(model.B) > ORIGIN_WITHIN * radius)
@@ -57,10 +60,10 @@ def _short(values: Array) -> list[list[float]]:
     return [[float(f"{v:.6g}") for v in row] for row in values.tolist()]
 
 
-def _rests(calibration: Calibration, kind: Kind) -> tuple[Array, Array]:
+def _rests(calibration: Calibration, kind: Kind) -> tuple[Array, NDArray[np.intp]]:
     poses = calibration.poses
     if poses is None or kind not in poses.mean:
-        return np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
+        return np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     index = np.flatnonzero(np.isfinite(poses.mean[kind]).all(axis=1))[:MAX_RESTS]
     return poses.mean[kind][index], index + 1
 

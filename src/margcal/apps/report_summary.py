@@ -5,6 +5,7 @@ from __future__ import annotations
 from margcal.apps.report_data import residuals
 from margcal.apps.report_text import NAMES, esc, fixed, listing, number, plural
 from margcal.core.types import Calibration, Kind, SensorModel
+from margcal.core.units import KINDS
 
 FRAMES = {
     "housing": "the axes of the housing",
@@ -29,7 +30,10 @@ def masthead(calibration: Calibration) -> str:
 
 
 def _date(created: str | None) -> str:
-    return f'<time class="date">{esc(created, 40)[:16].replace("T", " ")}</time>' if created else ""
+    if not created:
+        return ""
+    zone = " UTC" if created.endswith(("Z", "+00:00")) else ""
+    return f'<time class="date">{esc(created[:16].replace("T", " "))}{zone}</time>'
 
 
 def _chip(calibration: Calibration) -> str:
@@ -44,12 +48,18 @@ def sentence(calibration: Calibration) -> str:
         return "No sensor could be calibrated; the findings below say why and what to record next."
     names = listing(NAMES[k] for k in models).capitalize()
     text = f"{names} {'is' if len(models) == 1 else 'are'} calibrated{_from_what(calibration)}, {_frame(calibration)}."
-    return f"{text} {_how_good(calibration)}"
+    return f"{text} {_how_good(calibration)}{_left_out(calibration)}"
+
+
+def _left_out(calibration: Calibration) -> str:
+    lost = {i.sensor for i in calibration.issues if i.level == "fail"} - set(calibration.models)
+    names = [NAMES[k] for k in KINDS if k in lost]
+    return f" The {listing(names)} could not be calibrated; the findings say why." if names else ""
 
 
 def _how_good(calibration: Calibration) -> str:
     models = calibration.models
-    known = {k: m.expected_error_deg for k, m in models.items() if m.expected_error_deg is not None}
+    known: dict[Kind, float] = {k: m.expected_error_deg for k, m in models.items() if m.expected_error_deg is not None}
     if not known:
         return "How true its directions are is not known: there is no covariance to tell it from."
     within = f"within {degrees(max(known.values()))} rms"
@@ -87,7 +97,7 @@ def _card(calibration: Calibration, kind: Kind, model: SensorModel) -> str:
         rows.append(("Method", esc(model.method, 40)))
     details = "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in rows if v)
     value = degrees(model.expected_error_deg)
-    caption = "expected direction error" if model.expected_error_deg is not None else "direction error not known"
+    caption = "expected direction error, rms" if model.expected_error_deg is not None else "direction error not known"
     return (
         f'<article class="card"><h2>{NAMES[kind].capitalize()}</h2><p class="figure">{value}</p>'
         f'<p class="caption">{caption}</p><dl>{details}</dl></article>'

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from margcal.apps.report_svg import Scale, percent, plot_row, scale_of, stretched, tick_labels, trace
+from margcal.apps.report_svg import TALL, WIDE, Scale, percent, plot_row, scale_of, stretched, tick_labels, trace
 from margcal.apps.report_text import NAMES, esc, fixed, listing, plural, unit_words
 from margcal.core import so3
-from margcal.core.types import Calibration, Poses, Recording, Stream
+from margcal.core.types import Array, Calibration, Kind, Poses, Recording, Stream
 
 BINS = 900
 MAX_RECORDINGS = 8
+MAX_RESTS = 200
+"""More rests than this in a recording are shaded without numbers."""
 LANE, PANEL, SPACE, FOOT = 30.0, 104.0, 26.0, 24.0
 """Heights in pixels: lane of the rests, panel of a sensor, room above it for its name, time axis."""
 
@@ -19,7 +21,7 @@ LANE, PANEL, SPACE, FOOT = 30.0, 104.0, 26.0, 24.0
 def timelines(calibration: Calibration) -> str:
     """A picture for each recording."""
     shown = [(i, r) for i, r in enumerate(calibration.recordings) if any(len(s.t) for s in r.streams.values())]
-    bins = max(250, BINS // max(1, len(shown[:MAX_RECORDINGS])))
+    bins = int(BINS / max(1, len(shown[:MAX_RECORDINGS])) ** 0.5)
     parts = [_timeline(calibration, recording, index, bins) for index, recording in shown[:MAX_RECORDINGS]]
     if len(shown) > MAX_RECORDINGS:
         parts.append(f'<p class="note">{plural(len(shown) - MAX_RECORDINGS, "further recording")} not drawn.</p>')
@@ -37,12 +39,13 @@ def _span(recording: Recording) -> Scale:
 
 def _timeline(calibration: Calibration, recording: Recording, index: int, bins: int) -> str:
     time = _span(recording)
-    streams = {k: s for k, s in recording.streams.items() if len(s.t)}
-    height = LANE + len(streams) * (PANEL + SPACE) + FOOT
+    streams: dict[Kind, Stream] = {k: s for k, s in recording.streams.items() if len(s.t)}
     mine = _rests_of(calibration.poses, index)
+    lane = LANE if len(mine) else 0.0
+    height = lane + len(streams) * (PANEL + SPACE) + FOOT
+    tops = [lane + SPACE + row * (PANEL + SPACE) for row in range(len(streams))]
     labels, frames, curves = [], [], []
-    for row, (kind, stream) in enumerate(streams.items()):
-        top = LANE + SPACE + row * (PANEL + SPACE)
+    for top, (kind, stream) in zip(tops, streams.items()):
         value = scale_of(stream.y)
         ticks, frame = _frame(value, top)
         labels.append(ticks)
@@ -50,7 +53,6 @@ def _timeline(calibration: Calibration, recording: Recording, index: int, bins: 
         curves.append(_curves(stream, time, value, top, bins))
         name = f"{NAMES[kind].capitalize()}, {unit_words(stream.unit)}"
         curves.append(f'<text class="panel-name" x="0" y="{top - 7:g}">{name}</text>')
-    tops = [LANE + SPACE + row * (PANEL + SPACE) for row in range(len(streams))]
     plot = [*frames, _time_axis(time, height), _rests(calibration, mine, time, tops), *curves]
     title = f"Readings of {esc(recording.source)} over time with {plural(len(mine), 'rest')}"
     return (
@@ -70,6 +72,8 @@ def _rests(calibration: Calibration, mine: Index, time: Scale, tops: list[float]
     poses = calibration.poses
     if poses is None:
         return ""
+    if len(mine) > MAX_RESTS:
+        return _shading(time(poses.start[mine]), time(poses.stop[mine]), tops)
     parts, last = [], {"wide": -1.0, "narrow": -1.0}
     for i in mine.tolist():
         start, stop = float(poses.start[i]), float(poses.stop[i])
@@ -87,6 +91,13 @@ def _rests(calibration: Calibration, mine: Index, time: Scale, tops: list[float]
         parts.append(_rest_number(i + 1, middle, last))
     parts += [_turn(poses, t.before, t.after, time) for t in calibration.turns if t.before in mine]
     return "".join(parts)
+
+
+def _shading(start: Array, stop: Array, tops: list[float]) -> str:
+    """Rests without numbers, where they are too many for them."""
+    spans = np.rint(WIDE * np.column_stack([start, np.maximum(stop - start, 0)])).astype(np.int64).tolist()
+    path = "".join(f"M{a} 0h{w}v{TALL}h-{w}z" for a, w in spans[: 20 * MAX_RESTS])
+    return "".join(stretched(f'<path class="rest" d="{path}"/>', top, PANEL) for top in tops)
 
 
 def _knock(x: float) -> str:

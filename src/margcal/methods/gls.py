@@ -37,6 +37,8 @@ from margcal.methods.affine import checked_readings, checked_rotations
 from margcal.methods.one_step import one_step
 
 MAX_ITER = 40
+REML_ITER = 20
+"""Rounds in which the two components are estimated; the change of the last is far below their standard error."""
 STEP_TOL = 1e-6
 """Largest last step, in standard deviations of the unknowns."""
 START_S_ROT = np.radians(0.1)
@@ -130,23 +132,24 @@ def gls_ml(
     kappa2 = np.ones(lead) if noise_sd is not None else _first_noise(z, R, state, weight, noise)
     rot2 = np.full(lead, (START_S_ROT if s_rot is None else s_rot) ** 2)
     free = np.array([noise_sd is None, s_rot is None])
-    converged, n_iter, clear = np.zeros(lead, dtype=bool), 0, False
-    while n_iter < max_iter and not (converged.all() and clear):
+    converged, n_iter = np.zeros(lead, dtype=bool), 0
+    while n_iter < max_iter and not (converged.all() and not free.any()):
         n_iter += 1
         at = _linearise(z, R, state, kappa2, rot2, noise, weight)
         moved = np.max(np.abs(at.step) / np.sqrt(np.diagonal(at.inverse, axis1=-2, axis2=-1)), axis=-1)
         state = _moved(state, at.step)
+        converged = moved < STEP_TOL
+        if not free.any():
+            continue
         new_kappa2, new_rot2, rot2_se = _reml(at, kappa2, rot2, weight, free)
         least = np.mean(noise**2, axis=(-1, -2)) * kappa2
         changed = np.maximum(np.abs(new_kappa2 / kappa2 - 1), np.abs(new_rot2 - rot2) / (rot2 + least))
         kappa2, rot2 = new_kappa2, new_rot2
-        converged = (moved < STEP_TOL) & (changed < (1e-5 if n_iter < 15 else 1e-3))
-        if converged.all() and free[1] and not clear:
+        if n_iter >= REML_ITER or np.all(converged & (changed < 1e-4)):
             # an s_rot that is not clear of zero is noise: taken at its word it would widen every covariance
-            rot2 = np.where(rot2 < rot2_se, MIN_S_ROT**2, rot2)
-            free = np.array([free[0], False])
-            clear, converged = True, np.zeros(lead, dtype=bool)
-        clear |= not free[1]
+            rot2 = np.where(rot2 < rot2_se, MIN_S_ROT**2, rot2) if free[1] else rot2
+            free = np.zeros(2, dtype=bool)
+            converged = np.zeros(lead, dtype=bool)
     at = _linearise(z, R, state, kappa2, rot2, noise, weight)
     return _to_fit(
         at, state, y, R, centre, size, magnitude, kappa2, rot2, converged, n_iter, kind, raw_unit, unit, weight

@@ -162,7 +162,7 @@ def gauss_newton(
     sd: ArrayLike | None = None,
     sigma_angle: float | None = None,
     max_iter: int = 20,
-    tol: float = 1e-2,
+    tol: float = 0.3,
     raw_unit: str = "count",
 ) -> Fit:
     """H and B of the gyroscope from turns whose rotations are known: Gauss-Newton on SO(3).
@@ -184,7 +184,8 @@ def gauss_newton(
     sigma_angle : float, rad, optional
         Noise of the known rotations, each axis. Without it, what the misfits show beyond `sd`.
     max_iter, tol : int, float
-        Stop after so many iterations, or with the step that is shorter than `tol` standard errors.
+        Stop after so many iterations, or with the step that is shorter than `tol` standard errors (what is
+        then left is of second order: about 1e-3 of a standard error).
 
     Returns
     -------
@@ -229,7 +230,7 @@ def propagate_gravity(
     sd: ArrayLike | None = None,
     sigma_angle: float | None = None,
     max_iter: int = 30,
-    tol: float = 1e-2,
+    tol: float = 0.3,
     raw_unit: str = "count",
 ) -> Fit:
     """H and B of the gyroscope from turns at whose ends directions are known in the node frame.

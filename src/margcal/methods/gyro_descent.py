@@ -260,7 +260,7 @@ def _coarse_to_fine(problem: Problem, H: Array, B: Array, max_iter: int, tol: fl
     if problem.batch.dt.shape[1] < 16 * _THIN:
         return _descend(problem, H, B, max_iter, tol)
     sd = None if problem.sd is None else problem.sd / np.sqrt(_THIN)
-    coarse = _descend(replace(problem, batch=_thinned(problem.batch), sd=sd), H, B, max_iter, tol, near=0.3)
+    coarse = _descend(replace(problem, batch=_thinned(problem.batch), sd=sd), H, B, max_iter, tol, near=0.05)
     fine = _descend(problem, coarse.point.H, coarse.point.B, max_iter, tol)
     return replace(
         fine, H=coarse.H[:-1] + fine.H, B=coarse.B[:-1] + fine.B, costs=coarse.costs[: len(coarse.H) - 1] + fine.costs

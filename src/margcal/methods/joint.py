@@ -42,6 +42,8 @@ SAMPLING_ERROR = 0.1
 """Error of one sampling interval as a fraction of the angle by which the rate's second difference misses."""
 FIRST_S_ROT = np.radians(0.3)
 """Start of the attitude error s_rot, rad, before it is estimated."""
+CHECKABLE = 0.02
+"""Redundancy below which a residual says nothing of an error (the other readings do not check it)."""
 COMPONENT_TOL = 1e-3
 """Relative change of a variance component that no longer matters: its own standard error is above 5 %."""
 MIN_REDUNDANCY = 3.0
@@ -72,7 +74,10 @@ class Triad:
 
 @dataclass(frozen=True)
 class Gyro:
-    """The gyroscope: its means at rest and the turns ``before -> after`` between rests."""
+    """The gyroscope: its means at rest and the turns ``before -> after`` between rests.
+
+    `weight` (T,): 0 for a turn that does not count.
+    """
 
     y: Array
     se: Array
@@ -82,6 +87,7 @@ class Gyro:
     before: Array
     after: Array
     noise_sd: Array
+    weight: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,7 @@ class Priors:
     Attributes
     ----------
     R0 : ndarray (J, 3, 3) or None
-        Nominal attitudes; the deviation has the estimated standard deviation s_rot about each axis.
+        Nominal attitudes; the deviation has the estimated standard deviation s_rot about each axis. NaN: none.
     up : ndarray (J, 3) or None
         Housing direction that points up at each rest, within `level_sd` (rad).
     vertical_sd : float or None
@@ -108,6 +114,14 @@ class Priors:
 
 
 @dataclass(frozen=True)
+class _State:
+    A: dict[Kind, Array]
+    B: dict[Kind, Array]
+    u: dict[Kind, Array]
+    R: Array
+
+
+@dataclass(frozen=True)
 class JointFit:
     """The estimate; `covariance[kind]` (12, 12) is that of (H row by row, then B)."""
 
@@ -119,20 +133,14 @@ class JointFit:
     component: dict[str, float]
     redundancy: dict[str, float]
     residual: dict[Kind, Array]
-    standardized: dict[str, Array]
+    deletion: dict[str, Array]
     s_rot: float | None
+    state: _State
+    inverse: Array
     cost: float
     dof: float
     n_iter: int
     converged: bool
-
-
-@dataclass(frozen=True)
-class _State:
-    A: dict[Kind, Array]
-    B: dict[Kind, Array]
-    u: dict[Kind, Array]
-    R: Array
 
 
 @dataclass(frozen=True)
@@ -336,7 +344,8 @@ def _turn_block(gyro: Gyro, layout: _Layout, state: _State) -> _Block:
     C = pre.C + _turn_variance(gyro.turns, H, B)[:, None, None] * np.eye(3)
     W = np.linalg.inv(np.linalg.cholesky(C))
     r, J = np.einsum("tij,tj->ti", W, r), W @ J
-    return _Block("turn", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 3))
+    turn = np.arange(len(r)) if gyro.weight is None else np.flatnonzero(gyro.weight)
+    return _Block("turn", r[turn].ravel(), J[turn].reshape(-1, layout.size), np.repeat(turn, 3))
 
 
 def _turn_variance(turns: TurnBatch, H: Array, B: Array) -> Array:
@@ -351,11 +360,12 @@ def _turn_variance(turns: TurnBatch, H: Array, B: Array) -> Array:
 
 
 def _attitude_block(R0: Array, layout: _Layout, state: _State) -> _Block:
-    """(iv): log(R0^T R), in units of rad (its component is s_rot)."""
-    r = so3.log(np.swapaxes(R0, -1, -2) @ state.R)
+    """(iv): log(R0^T R), in units of rad (its component is s_rot); rests whose R0 is NaN have none."""
+    rest = np.flatnonzero(np.isfinite(R0).all(axis=(1, 2)))
+    r = so3.log(np.swapaxes(R0[rest], -1, -2) @ state.R[rest])
     J = np.zeros((len(r), 3, layout.size))
-    _put(J, layout.R, so3.left_jacobian_inverse(-r))
-    return _Block("rot", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 3))
+    _put(J, layout.R[rest], so3.left_jacobian_inverse(-r))
+    return _Block("rot", r.ravel(), J.reshape(-1, layout.size), np.repeat(rest, 3))
 
 
 def _level_block(up: Array, level_sd: float, layout: _Layout, state: _State) -> _Block:
@@ -452,6 +462,44 @@ def _redundancy(block: _Block, inverse: Array, parts: Mapping[str, Array]) -> fl
     return len(block.r) - float(np.sum(inverse * parts[block.name]))
 
 
+def predicted_misfit(
+    fit: JointFit, triads: Mapping[Kind, Triad], gyro: Gyro | None, priors: Priors, name: str, index: int
+) -> tuple[float, float]:
+    """How far one rest's (or turn's) readings are from what a fit without them predicts.
+
+    Parameters
+    ----------
+    fit : JointFit
+        Made without these rows; `triads`, `gyro`, `priors` hold them.
+    name : {'acc', 'mag', 'rot', 'turn'}
+    index : int, of the rest or turn
+
+    Returns
+    -------
+    chi2 : float
+        3 degrees of freedom, with the uncertainty of rows and prediction.
+    size : float
+        Length of the misfit: of a reading relative to its magnitude, of an attitude or a turn in rad.
+    """
+    layout = _lay_out(triads, gyro, len(fit.R))
+    blocks = {b.name: b for b in _blocks(_Data(triads, gyro, priors, layout), fit.state)}
+    block, sigma = blocks[name], fit.component.get(name, 1.0)
+    rows = block.rest == index
+    r, J = block.r[rows] / sigma, block.J[rows] / sigma
+    S = np.eye(len(r)) + J @ fit.inverse @ J.T
+    chi2 = float(r @ np.linalg.solve(S, r))
+    if name in triads:
+        kind: Kind = "acc" if name == "acc" else "mag"
+        off = block.r[rows] * triads[kind].se[index]
+        return chi2, float(np.linalg.norm(fit.H[kind] @ off) / np.linalg.norm(fit.u[kind]))
+    if name == "turn":
+        assert gyro is not None
+        dR = integrate(gyro.turns.y[index], gyro.turns.dt[index], fit.H["gyr"], fit.B["gyr"])
+        net = fit.R[gyro.before[index]].T @ fit.R[gyro.after[index]]
+        return chi2, float(so3.angle_between(dR, net))
+    return chi2, float(np.linalg.norm(block.r[rows]))
+
+
 # --- result ------------------------------------------------------------------------------------------
 
 
@@ -486,8 +534,10 @@ def _result(
         component={b.name: _sigma(b.name, scale) for b in blocks},
         redundancy=redundancy,
         residual=residual,
-        standardized={b.name: _standardized(b, scale, inverse) for b in blocks},
+        deletion={b.name: _deletion(b, _sigma(b.name, scale), inverse) for b in blocks},
         s_rot=_sigma("rot", scale) if data.priors.R0 is not None else None,
+        state=state,
+        inverse=inverse,
         cost=_cost(blocks, scale),
         dof=float(sum(redundancy.values())),
         n_iter=n_iter,
@@ -507,12 +557,17 @@ def _model_covariance(layout: _Layout, inverse: Array, kind: Kind, H: Array, *, 
     return (C + C.T) / 2
 
 
-def _standardized(block: _Block, scale: Mapping[str, float], inverse: Array) -> Array:
-    """Largest standardized residual (over its own standard deviation after the fit) of each rest or turn."""
-    J = block.J / _sigma(block.name, scale)
-    leverage = np.einsum("ip,pq,iq->i", J, inverse, J)
-    sd = np.sqrt(np.maximum(1 - leverage, 1e-3))
-    z = np.abs(block.r / _sigma(block.name, scale)) / sd
-    worst = np.zeros(int(block.rest.max()) + 1)
-    np.maximum.at(worst, block.rest, z)
-    return worst
+def _deletion(block: _Block, sigma: float, inverse: Array) -> Array:
+    """By how much the cost falls without each rest's (or turn's) rows of this block: chi-square with as many
+    degrees of freedom as there are rows. ``r^T (I - J N^-1 J^T)^-1 r``, exact for the linear problem."""
+    out = np.full(int(block.rest.max()) + 1, np.nan)
+    rows = int(np.sum(block.rest == block.rest[0]))
+    r, J = block.r.reshape(-1, rows) / sigma, block.J.reshape(-1, rows, block.J.shape[1]) / sigma
+    left = np.eye(rows) - J @ inverse @ np.swapaxes(J, -1, -2)
+    # a row that alone determines an unknown has nothing to be checked by: its direction is skipped
+    values, vectors = np.linalg.eigh(left)
+    along = np.einsum("jab,ja->jb", vectors, r)
+    out[block.rest[::rows]] = np.sum(
+        np.where(values > CHECKABLE, along**2 / np.maximum(values, CHECKABLE), 0.0), axis=1
+    )
+    return out

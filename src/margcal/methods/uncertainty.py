@@ -94,3 +94,52 @@ def direction_errors_deg(H: Array, B: Array, H_true: Array, B_true: Array, magni
     v = (z + offset) @ H.T
     cross = np.linalg.norm(np.cross(v, u), axis=1)
     return np.degrees(np.arctan2(cross, np.sum(v * u, axis=1)))
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """The least certain combination of parameters: `what` is 'rotation', 'stretch' or 'bias'; `text` in words."""
+
+    what: str
+    sd: float
+    text: str
+
+
+def weakest_direction(kind: Kind, H: Array, covariance: Array, magnitude: float) -> WeakDirection:
+    """Name the combination of (H, B) that the data determine least.
+
+    In relative units, ``E = dH H^-1`` (its antisymmetric part turns the frame, its symmetric part stretches it) and
+    ``H dB / magnitude``, the covariance's largest eigenvector is taken apart.
+    """
+    inverse = np.linalg.inv(H)
+    to = np.zeros((12, 12))
+    to[:9, :9] = np.kron(np.eye(3), inverse.T)  # rows of E = rows of dH times H^-1
+    to[9:, 9:] = H / magnitude
+    values, vectors = np.linalg.eigh(to @ covariance @ to.T)
+    sd, worst = float(np.sqrt(max(values[-1], 0.0))), vectors[:, -1]
+    E, b = worst[:9].reshape(3, 3), worst[9:]
+    turn = np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]]) / np.sqrt(2)
+    stretch = (E + E.T) / 2
+    parts = {"rotation": np.linalg.norm(turn), "stretch": np.linalg.norm(stretch)}
+    if kind != "gyr":
+        parts["bias"] = np.linalg.norm(b)
+    what = max(parts, key=lambda k: float(parts[k]))
+    if what == "rotation":
+        about, size = _axis_words(turn), np.degrees(sd)
+        text = f"the rotation of its frame about {about} is the least determined ({size:.1f} degrees)"
+    elif what == "stretch":
+        along = np.linalg.eigh(stretch)
+        axis = along[1][:, np.argmax(np.abs(along[0]))]
+        text = f"its gain along {_axis_words(axis)} is the least determined ({100 * sd:.1f} %)"
+    else:
+        text = f"its bias along {_axis_words(b)} is the least determined ({100 * sd:.1f} % of the magnitude)"
+    return WeakDirection(what, sd, text)
+
+
+def _axis_words(v: Array) -> str:
+    v = v / np.linalg.norm(v)
+    k = int(np.argmax(np.abs(v)))
+    if abs(v[k]) > 0.95:
+        return f"the {'xyz'[k]} axis"
+    v = v * np.sign(v[k])
+    return f"({v[0]:.1f} {v[1]:.1f} {v[2]:.1f})"

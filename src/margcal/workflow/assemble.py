@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -11,25 +11,26 @@ from margcal.core import so3
 from margcal.core.types import Array, Calibration, Fit, Issue, Kind, Recording, SensorModel
 from margcal.core.units import KINDS
 from margcal.methods.uncertainty import expected_error
-from margcal.workflow.job import NAMES, Job, Solved
-
-MAX_ERROR_DEG = 2.0
-"""Expected direction error above which a sensor is refused (conventions: `fail`)."""
+from margcal.workflow.checks import Check, run_checks
+from margcal.workflow.job import Job, Solved
 
 
-def assemble(job: Job, solved: Solved, issues: list[Issue]) -> Calibration:
-    """Name the result of a route; `issues` are those found before it."""
+def assemble(job: Job, solved: Solved, issues: list[Issue], *, keep_failed: bool = False) -> Calibration:
+    """Name the result of a route and check it; `issues` are those found before it.
+
+    A sensor that fails a check is left out, unless `keep_failed`.
+    """
     issues = issues + solved.issues
     models: dict[Kind, SensorModel] = {}
     for kind in (k for k in KINDS if k in solved.fits):
         fit = _signed(job, kind, solved, issues)
-        model = _finished(job, kind, fit, solved)
-        solved.fits[kind] = replace(fit, model=model)
-        doubt = _too_uncertain(model)
-        if doubt is None:
-            models[kind] = model
-        else:
-            issues.append(doubt)
+        models[kind] = _finished(job, kind, fit, solved)
+        solved.fits[kind] = replace(fit, model=models[kind])
+    checks = run_checks(job, solved, models.values())
+    issues += [c.issue for c in checks if c.level != "pass"]
+    lost = {c.sensor for c in checks if c.level == "fail"}
+    if not keep_failed:
+        models = {k: m for k, m in models.items() if k not in lost and None not in lost}
     _mirrored(models, issues)
     return Calibration(
         acc=models.get("acc"),
@@ -37,11 +38,18 @@ def assemble(job: Job, solved: Solved, issues: list[Issue]) -> Calibration:
         mag=models.get("mag"),
         frame=job.attitudes.frame,
         issues=tuple(dict.fromkeys(issues)),
+        settings={"checks": [_plain(c) for c in checks]},
         fits=dict(solved.fits),
         poses=replace(job.segmentation.poses, R=solved.R),
         turns=job.segmentation.turns,
         recordings=job.recordings,
     )
+
+
+def _plain(check: Check) -> dict[str, object]:
+    """A check as the calibration file keeps it: plain JSON values, NaN as null."""
+    row = asdict(check)
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
 def _signed(job: Job, kind: Kind, solved: Solved, issues: list[Issue]) -> Fit:
@@ -116,12 +124,12 @@ def _finished(job: Job, kind: Kind, fit: Fit, solved: Solved) -> SensorModel:
     _, index = job.readings(kind)
     delay = solved.delays.get(kind, (None, None))
     residual = np.asarray(fit.residual)
-    rests = len(index) if kind not in solved.sources else None
+    rests = None if kind in solved.sources else len(index) if kind == "gyr" else int(np.isfinite(residual).sum())
     return replace(
         model,
         raw_unit=job.raw_unit(kind),
         unit=job.options.unit[kind],
-        residual_rms=float(np.sqrt(np.mean(residual**2))),
+        residual_rms=float(np.sqrt(np.nanmean(residual**2))),
         n_poses=rests,
         method=fit.method,
         reference_vector=solved.vectors.get(kind),
@@ -130,19 +138,6 @@ def _finished(job: Job, kind: Kind, fit: Fit, solved: Solved) -> SensorModel:
         delay_se_s=delay[1],
         temperature_degC=_temperature(job),
     )
-
-
-def _too_uncertain(model: SensorModel) -> Issue | None:
-    """Why a model is not handed out: its own covariance says that its directions mean nothing."""
-    error = model.expected_error_deg
-    if error is None or error <= MAX_ERROR_DEG:
-        return None
-    name = NAMES[model.kind]
-    text = (
-        f"{name}: the recording leaves its directions open (expected error {min(error, 180):.1f} degrees, limit "
-        f"{MAX_ERROR_DEG:g}); record more rests in more attitudes, spread over the sphere, with turns about all axes"
-    )
-    return Issue("too-uncertain", "fail", text, model.kind, error, MAX_ERROR_DEG)
 
 
 def _temperature(job: Job) -> float | None:

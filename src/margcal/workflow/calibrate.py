@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from margcal.core.errors import DataError, InputError, UsageError
-from margcal.core.types import Calibration, Issue, Kind, Recording
+from margcal.core.types import Calibration, Issue, Kind, Recording, Verdict
 from margcal.core.units import KINDS, STANDARD_GRAVITY
 from margcal.workflow import routes
 from margcal.workflow.assemble import assemble
+from margcal.workflow.checks import verdict_of
 from margcal.workflow.decide import decide
 from margcal.workflow.job import NAMES, Job, Options, Solved
 from margcal.workflow.lint import lint
@@ -101,13 +102,14 @@ def calibrate(
     options = replace(options, sensors=tuple(k for k in options.sensors if k not in lame))
     job = _job(usable, poses, options, level, issues)
     solved = _solve(job, auto=poses == "auto")
-    calibration = assemble(job, solved, issues)
+    calibration = assemble(job, solved, issues, keep_failed=allow_fail)
     calibration = replace(
         calibration,
         device=device,
         files=_hashes(recordings),
-        settings=_settings(job, poses, solved, sensors, place, level),
+        settings={**_settings(job, poses, solved, sensors, place, level), **calibration.settings},
     )
+    calibration = replace(calibration, verdict=_verdict(calibration, sensors))
     if not allow_fail:
         _refuse(calibration, sensors, recordings)
     return calibration
@@ -238,6 +240,13 @@ def _file_index(recordings: Sequence[Recording], table: PoseTable) -> list[int]:
             )
         out.append(names.index(Path(name).name))
     return out
+
+
+def _verdict(calibration: Calibration, sensors: Sequence[Kind] | None) -> Verdict:
+    """The verdict of the checks; models that are kept in spite of a failed check do not count."""
+    failed = {i.sensor for i in calibration.issues if i.level == "fail"}
+    sound = {k: None for k in calibration.models if k in failed or None in failed}
+    return verdict_of(replace(calibration, **sound), sensors)
 
 
 def _refuse(calibration: Calibration, sensors: Sequence[Kind] | None, recordings: Sequence[Recording]) -> None:

@@ -78,6 +78,8 @@ class Solved:
     delays: dict[Kind, tuple[float, float | None]] = field(default_factory=dict)
     R: Array | None = None
     joint: JointFit | None = None
+    singles: dict[Kind, Fit] = field(default_factory=dict)
+    left_out: int = 0
 
     def attempt(self, kind: Kind, solve: Callable[[], Fit]) -> Fit | None:
         """Keep the fit of one sensor, or the reason why there is none."""

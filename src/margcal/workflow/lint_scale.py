@@ -25,8 +25,9 @@ ABRUPT_NOISE = 6.0
 """The same in noise (sd): steps that large in and out of a level stretch are motion that was cut off."""
 HEAP, HEAP_LEAST = 5.0, 10
 """Readings at the extreme over those at a value next to it, and how many make a heap."""
-CHANCE = 1e-4
-"""Chance of a run of equal neighbours up to which it is taken for clipping."""
+CHANCE, CHANCE_CUT_OFF = 1e-6, 1e-3
+"""Chance of a run of equal neighbours up to which it is taken for clipping: by noise (a recording has eighteen
+extremes, and few recordings in 10 000 may give a false alarm), and between steps of motion."""
 SIXTEEN_BITS = ((0.0, 65535.0), (-32768.0, 32767.0))
 NEAR_END = 0.004
 """Share of a 16-bit scale at either end that is not trusted (converters bend before they clip)."""
@@ -127,7 +128,7 @@ def _clips_at(view: View, axis: int, extreme: float) -> bool:
     equal = np.count_nonzero((x[1:] == x[:-1]) & ~at[1:]) / max(np.count_nonzero(~at), 1)
     by_noise = 0.28 * lsb / noise  # two equal neighbours, normal noise of many steps
     unlikely = max(equal, by_noise, 1e-9) ** length < CHANCE
-    cut_off = (step >= ABRUPT_NOISE * noise) & (_equal_in_motion(x, at, noise) ** length < 10 * CHANCE)
+    cut_off = (step >= ABRUPT_NOISE * noise) & (_equal_in_motion(x, at, noise) ** length < CHANCE_CUT_OFF)
     if np.any((step >= ABRUPT_LSB * lsb) & (unlikely | cut_off)):
         return True
     near = np.count_nonzero(np.abs(x[~at] - extreme) <= 10.5 * lsb) / 10

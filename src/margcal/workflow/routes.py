@@ -21,12 +21,13 @@ from margcal.methods import gyro_paper, transform
 from margcal.methods.alignment import rotation_from_dip
 from margcal.methods.coverage import distinct_directions
 from margcal.methods.gyro_start import rotation_starts
-from margcal.methods.joint import Gyro, JointFit, Priors, Triad, joint_fit
+from margcal.methods.joint import Gyro, JointFit, Priors, Triad
 from margcal.methods.levelled import level_prior
 from margcal.methods.preintegration import integrate, pad
 from margcal.methods.uncertainty import expected_error
 from margcal.workflow import attitudes as att
 from margcal.workflow.job import NAMES, Job, Solved
+from margcal.workflow.robust import issues_of, robust_joint
 from margcal.workflow.turns import (
     along_turns,
     check_full_turns,
@@ -104,8 +105,8 @@ def _own_frames(job: Job, solved: Solved) -> None:
         if fit is None:
             continue
         text = (
-            f"{NAMES[kind]}: method {job.options.pose_method} uses magnitudes only; H is in the sensor's own frame, not "
-            "in the housing's, and only magnitudes can be trusted; leave --method out to have all sensors in one frame"
+            f"{NAMES[kind]}: method {job.options.pose_method} uses magnitudes only; H is in the sensor's own frame, "
+            "not in the housing's, and only magnitudes can be trusted; leave --method out to have one frame for all"
         )
         solved.issues.append(Issue("own-frame", "warn", text, kind))
         solved.fits[kind] = replace(fit, model=replace(fit.model, covariance=None), covariance=None)
@@ -237,7 +238,7 @@ def _with_gravity(job: Job, solved: Solved, priors: Priors, *, triangular: bool)
         _jointly(job, solved, turns, priors, triangular=triangular)
     else:
         _say_what_was_taken(job, solved)
-    if acc.rank < 9:
+    if solved.joint is None:
         _inherit_frame_error(job, solved, acc)
     check_full_turns(job, solved)
     return solved
@@ -254,7 +255,8 @@ def _say_what_was_taken(job: Job, solved: Solved) -> None:
 
 
 def _inherit_frame_error(job: Job, solved: Solved, acc: Fit) -> None:
-    """Directions by an accelerometer whose axes are taken as orthogonal are no better than its own."""
+    """Fitted one after the other, gyroscope and magnetometer know the frame no better than the accelerometer does
+    (which may have been levelled by the table alone, or has had its axes taken as orthogonal)."""
     sd = np.radians(_acc_error(job, acc)) / np.sqrt(2)  # about each axis
     for kind in ("gyr", "mag"):
         fit = solved.fits.get(kind)
@@ -374,13 +376,16 @@ def _jointly(
     triads = {k: triad_of(job, k, whole[k], solved, triangular, free_up) for k in poses if k in whole}
     gyro = gyro_of(job, whole["gyr"], _not_full(turns, whole)) if "gyr" in whole else None
     assert solved.R is not None
-    joint = joint_fit(triads, gyro, solved.R, priors)
-    if joint.converged and all(np.isfinite(h).all() for h in joint.H.values()):
-        adopt(solved, joint)
+    robust = robust_joint(triads, gyro, solved.R, priors)
+    if robust.fit.converged and all(np.isfinite(h).all() for h in robust.fit.H.values()):
+        solved.singles = dict(solved.fits)
+        solved.left_out = len(robust.left_out)
+        adopt(solved, robust.fit)
+        solved.issues += issues_of(robust, cube=job.attitudes.mode in ("cube", "file"))
         return
     text = (
-        f"the joint fit of all sensors did not converge in {joint.n_iter} iterations; each sensor was calibrated by "
-        "itself, with larger errors: look at the residuals for a wrong attitude"
+        f"the joint fit of all sensors did not converge in {robust.fit.n_iter} iterations; each sensor was "
+        "calibrated by itself, with larger errors: look at the residuals for a wrong attitude"
     )
     solved.issues.append(Issue("joint-not-converged", "warn", text))
 

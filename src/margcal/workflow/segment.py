@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -261,7 +262,7 @@ def _spread(recording: Recording, stretches: Sequence[tuple[float, float]]) -> d
         means = np.array([_mean(stream, s) for s in long])
         if kind == "gyr":
             bias = np.nanmedian(means, axis=0)
-            moved = [np.linalg.norm(_integral(stream, a[1], b[0], bias)) for a, b in zip(long, long[1:])]
+            moved = [np.linalg.norm(_integral(stream, a[1], b[0], bias)) for a, b in pairwise(long)]
             spread[kind] = float(np.median(moved))
         else:
             spread[kind] = float(np.nanmax(np.ptp(means, axis=0)) / 2)
@@ -404,7 +405,7 @@ def _find_turns(recording: Recording, rests: Sequence[_Rest], offset: int) -> tu
     if recording.gyr is None:
         return [], []
     turns, gaps = [], []
-    for i, (a, b) in enumerate(zip(rests, rests[1:])):
+    for i, (a, b) in enumerate(pairwise(rests)):
         turn = _cut_turn(recording.gyr, a.stop, b.start, offset + i)
         if turn is None:
             gaps.append(offset + i + 1)

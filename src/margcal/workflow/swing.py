@@ -80,7 +80,8 @@ def _aligned(job: Job, solved: Solved, recording: Recording, fit: Fit) -> None:
     v = fit.model.apply(mag.y[good]) / job.options.magnitude["mag"]
     found = rotation_from_rates(mag.t[good], v, gyr.t, rate)
     H = found.Omega @ fit.model.H
-    covariance = _turned_covariance(fit.covariance, found.Omega, found.se_deg, H)
+    se_deg = np.hypot(found.se_deg, _frame_error_deg(calibrated))
+    covariance = _turned_covariance(fit.covariance, found.Omega, se_deg, H)
     solved.fits["mag"] = replace(fit, model=replace(fit.model, H=H, covariance=covariance), covariance=covariance)
     if found.delay_s is not None:
         solved.delays["mag"] = (found.delay_s, found.delay_se_s)
@@ -91,6 +92,13 @@ def _aligned(job: Job, solved: Solved, recording: Recording, fit: Fit) -> None:
         f"[{found.se_deg[0]:.2f} {found.se_deg[1]:.2f} {found.se_deg[2]:.2f}] deg"
     )
     solved.issues.append(Issue("aligned-to-gyroscope", "note", text, "mag", float(np.nanmax(found.se_deg))))
+
+
+def _frame_error_deg(gyr: Fit | None) -> float:
+    """Error about each axis of the frame that the calibrated gyroscope hands on; one by its datasheet is the frame."""
+    if gyr is None or gyr.covariance is None or not np.isfinite(gyr.covariance).all():
+        return 0.0
+    return expected_error("gyr", gyr.model.H, gyr.covariance, 1.0).direction_deg / np.sqrt(2)
 
 
 def _turned_covariance(C: Array | None, Omega: Array, se_deg: Array, H: Array) -> Array | None:

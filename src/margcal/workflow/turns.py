@@ -19,7 +19,7 @@ from margcal.workflow.lint import clipped
 
 FULL_TURN_DEG = (345.0, 375.0)
 MIN_TURNS = 5
-FULL_TURN_TOLERANCE_DEG = 3.0
+FULL_TURN_BY_HAND_DEG = 2.0
 """How far from 360 degrees a full turn made by hand may end."""
 NOMINAL_GAIN_SD = 0.03
 """Datasheet tolerance of a gyroscope's gain (consumer parts: 1-3 %), used where the turns do not tell it."""
@@ -92,12 +92,24 @@ def check_full_turns(job: Job, solved: Solved) -> None:
         return
     found = full_turns(full, fit.model.H, fit.model.B, low_deg=300, high_deg=420)
     angles = ", ".join(f"{a:.1f}" for a in found.angle_deg)
-    worst = float(np.max(np.abs(found.angle_deg - 360.0), initial=0.0))
+    off = np.abs(found.angle_deg - 360.0)
+    limit = FULL_TURN_BY_HAND_DEG + 3 * np.array([360 * _gain_sd(fit, axis) for axis in found.axis])
     text = f"gyroscope: {len(full)} full turns, kept out of the fit as a check, close at {angles} degrees"
-    if worst > FULL_TURN_TOLERANCE_DEG:
-        text += f"; {worst / 3.6:.1f} % is more than a turn made by hand misses by: record more turns about that axis"
-    level = "note" if worst <= FULL_TURN_TOLERANCE_DEG else "warn"
-    solved.issues.append(Issue("full-turns", level, text, "gyr", worst, FULL_TURN_TOLERANCE_DEG))
+    wrong = bool(np.any(off > limit))
+    if wrong:
+        text += "; that is more than its covariance allows: record more turns about that axis"
+    worst = int(np.argmax(off - limit))
+    level = "warn" if wrong else "note"
+    solved.issues.append(Issue("full-turns", level, text, "gyr", float(off[worst]), float(limit[worst])))
+
+
+def _gain_sd(fit: Fit, axis: Array) -> float:
+    """Relative standard deviation of the gain about a unit `axis` (3,) of the node frame."""
+    if fit.covariance is None:
+        return 0.0
+    # the gain about the axis is a . dH H^-1 a
+    gradient = np.outer(axis, np.linalg.inv(fit.model.H) @ axis).ravel()
+    return float(np.sqrt(max(gradient @ fit.covariance[:9, :9] @ gradient, 0.0)))
 
 
 def with_nominal(job: Job, acc: SensorModel, solve: Callable[[], Fit], solved: Solved) -> Fit:

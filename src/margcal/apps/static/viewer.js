@@ -25,7 +25,7 @@ function margcalViewer(place, data) {
     return button;
   });
   const stretchGroup = element("div", { class: "group", role: "group", "aria-label": "Deviation from the sphere drawn larger" }, bar);
-  element("span", { class: "label" }, stretchGroup, "deviation");
+  element("span", { class: "label" }, stretchGroup, "deviation drawn");
   const stretchButtons = [1, 10, 100].map(function (factor) {
     const button = element("button", { type: "button" }, stretchGroup, "×" + factor);
     button.addEventListener("click", function () { state.stretch = factor; refresh(); });
@@ -239,9 +239,9 @@ function margcalViewer(place, data) {
   function points(g, dots, depth, tint, front) {
     g.save();
     g.fillStyle = tint;
-    g.globalAlpha = front ? 0.5 : 0.18;
+    g.globalAlpha = front ? 0.6 : 0.25;
     for (const p of dots) {
-      if ((p[2] >= depth) === front) g.fillRect(p[0] - 0.8, p[1] - 0.8, 1.6, 1.6);
+      if ((p[2] >= depth) === front) g.fillRect(p[0] - 0.9, p[1] - 0.9, 1.8, 1.8);
     }
     g.restore();
   }
