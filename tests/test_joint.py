@@ -203,7 +203,7 @@ def _nees(kind, fit, p) -> float:
 def many():
     out = []
     for seed in range(40):
-        p = make(1000 + seed, n=24, s_rot_deg=0.2)
+        p = make(1000 + seed, s_rot_deg=0.2)
         out.append((p, solve(p)))
     return out
 
@@ -218,10 +218,11 @@ def test_errors_are_as_large_as_the_covariance_says(many, kind):
 def test_cost_is_chi_square_of_the_redundancy(many):
     cost = np.array([fit.cost for _, fit in many])
     dof = np.array([fit.dof for _, fit in many])
-    # the components make every kind's cost equal to its redundancy at the estimate
-    assert cost / dof == pytest.approx(np.ones(40), abs=0.05)
-    rows = 24 * 3 * 4 + 23 * 3
-    unknowns = 3 * 12 + 2 * 2 + 24 * 3
+    # the components make every kind's cost equal to its redundancy, but where the least value of one holds it up
+    assert np.median(cost / dof) == pytest.approx(1, abs=0.02)
+    assert np.all((cost / dof > 0.85) & (cost / dof < 1.02))
+    rows = 20 * 3 * 4 + 19 * 3
+    unknowns = 3 * 12 + 2 * 2 + 20 * 3
     assert dof == pytest.approx(np.full(40, rows - unknowns), abs=1e-6)
 
 

@@ -44,8 +44,8 @@ def _c(model: SensorModel) -> str:
     k, name = model.kind.upper(), model.kind
     return (
         f"// {_comment(model.unit)} from {_comment(model.raw_unit)}, H row by row\n"
-        f"static const float {k}_H[9] = {{\n{_floats(model.H)}}},\n"
-        f"{k}_B[3] = {{{_floats(model.B).strip()}}};\n"
+        f"static const float {k}_H[9] = {{\n{_floats(model.H)}}};\n"
+        f"static const float {k}_B[3] = {{{_floats(model.B).strip()}}};\n"
         f"static inline void margcal_{name}(const float y[3], float u[3]) {{\n"
         f"    const float d[3] = {{y[0] - {k}_B[0], y[1] - {k}_B[1], y[2] - {k}_B[2]}};\n"
         f"    for (int i = 0; i < 3; i++) u[i] = {k}_H[3*i]*d[0] + {k}_H[3*i+1]*d[1] + {k}_H[3*i+2]*d[2];\n"

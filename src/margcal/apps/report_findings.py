@@ -25,17 +25,22 @@ _SETTINGS = {
 }
 _HIDDEN = {"attitudes_figures"}
 MAX_ISSUES = 300
+_ALONE = (
+    "This report was made from the calibration alone. Readings, attitudes and residuals are shown when it is given "
+    'the recording too: <code class="command">margcal report CALIBRATION.json RECORDING -o REPORT.html</code>'
+)
 
 
 def findings(calibration: Calibration) -> str:
     """The issues, the gravest first."""
     order = list(LEVELS)
     issues = sorted(calibration.issues, key=lambda i: order.index(i.level) if i.level in LEVELS else 9)
+    alone = "" if calibration.recordings else f'<p class="quiet">{_ALONE}</p>'
     if not issues:
-        return '<p class="quiet">Nothing to report.</p>'
+        return alone or '<p class="quiet">Nothing to report.</p>'
     more = len(issues) - MAX_ISSUES
     rest = f'<li class="note">{plural(more, "further finding")} not listed.</li>' if more > 0 else ""
-    return f'<ul class="findings">{"".join(map(_finding, issues[:MAX_ISSUES]))}{rest}</ul>'
+    return f'<ul class="findings">{"".join(map(_finding, issues[:MAX_ISSUES]))}{rest}</ul>{alone}'
 
 
 def _finding(issue: Issue) -> str:
@@ -74,9 +79,9 @@ def _methods(calibration: Calibration) -> str:
     rows = []
     for kind, model in calibration.models.items():
         fit = calibration.fits.get(kind)
-        source = esc(fit.cites, 300) if fit is not None else ""
-        rows.append([NAMES[kind].capitalize(), esc(model.method, 60) or "–", source or "–"])
-    return table(["Sensor", "Method", "Source"], rows, "methods") if rows else ""
+        row = [NAMES[kind].capitalize(), esc(model.method, 60) or "–"]
+        rows.append([*row, esc(fit.cites, 300) if fit is not None else "–"] if calibration.fits else row)
+    return table(["Sensor", "Method", "Source"][: len(rows[0])], rows, "methods") if rows else ""
 
 
 def _settings(settings: Mapping[str, Any]) -> str:

@@ -57,7 +57,7 @@ def esc_code(text: str) -> str:
 def _example(calibration: Calibration) -> str:
     rows = []
     for kind, model in calibration.models.items():
-        y = _typical_reading(calibration, model)
+        y = _reading(calibration, model)
         if y is None:
             continue
         u = model.apply(y)
@@ -79,19 +79,13 @@ def _vector(values: list[str]) -> str:
     return f'<span class="num">({", ".join(values)})</span>'
 
 
-def _typical_reading(calibration: Calibration, model: SensorModel) -> Array | None:
-    """A reading to check by: the mean of the first rest, else what the sensed vector along z would give; of a
-    gyroscope that of an arbitrary rate."""
-    poses = calibration.poses
-    y = model.invert(np.array([0.5, -1.0, 2.0])) if model.kind == "gyr" else None
-    if y is None and poses is not None and model.kind in poses.mean:
-        good = np.flatnonzero(np.isfinite(poses.mean[model.kind]).all(axis=1))
-        y = poses.mean[model.kind][good[0]] if len(good) else None
-    if y is None:
-        y = model.invert(np.array([0.0, 0.0, magnitude(calibration, model)]))
+def _reading(calibration: Calibration, model: SensorModel) -> Array | None:
+    """A round reading to check by, along no axis, so that a transposed H or a wrong sign shows."""
+    length = 1.0 if model.kind == "gyr" else magnitude(calibration, model)
+    y = model.invert(length * np.array([2.0, -1.0, 2.0]) / 3)
     if not np.isfinite(y).all():
         return None
-    places = decimals_for(float(np.linalg.norm(np.linalg.inv(model.H))) * 1e-3, 1) or 0
+    places = decimals_for(float(np.linalg.norm(np.linalg.inv(model.H))) * length * 1e-4, 1) or 0
     return np.round(y, places)
 
 

@@ -24,6 +24,7 @@ from margcal.methods.preintegration import TurnBatch
 WINDOW_RAD = 0.5
 """Angle turned in one window of `rotation_from_rates`: large beside the magnetometer's noise, short in time."""
 MAX_WINDOW_S = 1.0
+JACKKNIFE_BLOCKS = 6
 DELAYS_S = np.linspace(-0.06, 0.06, 7)
 """Delays that are tried before the parabola is laid through the best three."""
 
@@ -83,7 +84,8 @@ def rotation_from_rates(t: Array, v: Array, t_gyr: Array, rate: Array, *, delays
         If the motion does not determine the rotation.
     """
     edges = _window_edges(t, v)
-    costs = np.array([_solve(t, v, t_gyr, rate, edges, d).cost for d in delays])
+    first = _solve(t, v, t_gyr, rate, edges, 0.0)
+    costs = np.array([_solve(t, v, t_gyr, rate, edges, d, start=first.G).cost for d in delays])
     best = int(np.clip(np.argmin(costs), 1, len(delays) - 2))
     around, step = costs[best - 1 : best + 2], delays[1] - delays[0]
     curvature = (around[0] - 2 * around[1] + around[2]) / step**2
@@ -92,43 +94,72 @@ def rotation_from_rates(t: Array, v: Array, t_gyr: Array, rate: Array, *, delays
     if curvature > 0:
         delay = delay - 0.5 * step * (around[2] - around[0]) / (around[0] - 2 * around[1] + around[2])
         delay = float(np.clip(delay, delays[0], delays[-1]))
-    final = _solve(t, v, t_gyr, rate, edges, delay)
+    final = _solve(t, v, t_gyr, rate, edges, delay, start=first.G)
+    if final.mirrored:
+        text = (
+            "magnetometer and gyroscope differ in handedness: one of them has a mirrored axis, so the rotation between "
+            "them does not exist; find the axis whose sign the driver flips, or calibrate from rests and turns"
+        )
+        raise DataError(text, (Issue("mirrored-axes", "fail", text, "mag"),))
+    se_deg = np.maximum(final.se_deg, _jackknife(t, v, t_gyr, rate, edges, delay, final))
     if curvature > 0:
         # cost is a sum of squares with noise variance cost/dof: d2(cost)/d(delay)2 = 2 variance / se^2
         se = float(np.sqrt(2 * final.cost / final.dof / curvature))
-    return Alignment(
-        final.Omega,
-        final.se_deg,
-        float(delay),
-        se,
-        float(np.degrees(np.sqrt(final.cost / final.dof))),
-        final.gain,
-    )
+    misfit = float(np.degrees(np.sqrt(final.cost / final.dof)))
+    return Alignment(final.Omega, se_deg, float(delay), se, misfit, final.gain)
+
+
+def _jackknife(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Array, delay: float, full: _Solved) -> Array:
+    """Standard errors (3,) deg from leaving out one stretch of the motion at a time: misfits that last (a field that
+    differs from place to place) are not white, and the formal errors know nothing of them."""
+    blocks = np.array_split(np.arange(len(edges) - 1), JACKKNIFE_BLOCKS)
+    turns = []
+    for left_out in blocks:
+        keep = np.setdiff1d(np.arange(len(edges) - 1), left_out)
+        solved = _solve(t, v, t_gyr, rate, edges, delay, keep, full.G)
+        turns.append(so3.log(solved.Omega @ full.Omega.T))
+    off = np.array(turns) - np.mean(turns, axis=0)
+    k = len(blocks)
+    return np.degrees(np.sqrt((k - 1) / k * np.sum(off**2, axis=0)))
 
 
 @dataclass(frozen=True)
 class _Solved:
+    G: Array
     Omega: Array
     se_deg: Array
     cost: float
     dof: float
     gain: float
+    mirrored: bool
 
 
-def _solve(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Array, delay: float) -> _Solved:
+def _solve(
+    t: Array,
+    v: Array,
+    t_gyr: Array,
+    rate: Array,
+    edges: Array,
+    delay: float,
+    keep: Array | None = None,
+    start: Array | None = None,
+) -> _Solved:
     """Gyroscope matrix in the magnetometer's frame by propagating the field over windows; Omega is the
     transpose of its rotation."""
     batch, along = _windows(t - delay, v, t_gyr, rate, edges)
     unit = v / np.linalg.norm(v, axis=1, keepdims=True)
     before, after = unit[edges[:-1]], unit[edges[1:]]
     use = (batch.dt > 0).sum(axis=1) >= 2
+    if keep is not None:
+        use &= np.isin(np.arange(len(use)), keep)
     if use.sum() < 8:
         raise DataError("the motion is too short to align the magnetometer with the gyroscope", (_too_short(),))
     fit = propagate_gravity(
         batch.select(use),
         before[use],
         after[use],
-        along=along[use],
+        H0=start,
+        along=along[use] if start is None else None,
         bias_prior=(rate.mean(axis=0) * 0, np.eye(3) * 0.1**2),
         sigma_angle=1.0,
         raw_unit="rad/s",
@@ -147,7 +178,8 @@ def _solve(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Array, delay: f
                 J[i, 3 * a + k] -= Omega[j, a] / 2
         variance = np.diag(J @ fit.covariance[:9, :9] @ J.T) * r2 / dof
         se = np.degrees(np.sqrt(np.maximum(variance, 0.0)))
-    return _Solved(Omega, se, r2, dof, float(np.cbrt(abs(np.linalg.det(G)))))
+    det = float(np.linalg.det(G))
+    return _Solved(G, Omega, se, r2, dof, float(np.cbrt(abs(det))), det < 0)
 
 
 def _too_short() -> Issue:

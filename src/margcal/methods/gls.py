@@ -9,8 +9,9 @@ so the reading of pose j has covariance, with v_j = R_j u,
     S_j = kappa^2 diag(noise_sd_j^2) + s_rot^2 (A [v_j]x)(A [v_j]x)^T                                       (1)
 
 Gauss-Newton on (A, B, direction of u) with these weights, in turn with restricted maximum likelihood (REML) for
-kappa and s_rot. All leading axes are nodes (or one node with another pose left out in each): everything here is
-vectorised over them. Several sensors of one node share their e_j; that fit is `joint`.
+kappa and s_rot. The fit without housing error (s_rot = 0) comes first; the one with it is taken where its
+restricted likelihood is clearly larger. Nodes are independent and everything here is vectorised over them.
+Several sensors of one node share their e_j; that fit is `joint`.
 
 =============  ==========================================================  ===================
 name here      meaning                                                     shape
@@ -18,55 +19,88 @@ name here      meaning                                                     shape
 A, B           forward matrix H^-1 and bias                                (..., 3, 3), (..., 3)
 v              the sensed vector in each pose, R_j u                       (..., J, 3)
 S              covariance of each pose's reading, (1)                      (..., J, 3, 3)
-N              normal matrix of the 14 unknowns (A, B, two of u)           (..., 14, 14)
-P              S^-1 - S^-1 X N^-1 X^T S^-1, X the derivatives              blocks (..., J, 3, 3)
+X              derivatives of the readings by the 14 unknowns (A, B, u)    (..., J, 3, 14)
+N              normal matrix, X^T S^-1 X                                   (..., 14, 14)
+P              S^-1 - S^-1 X N^-1 X^T S^-1                                 blocks (..., J, 3, 3)
 =============  ==========================================================  ===================
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit, Issue, Kind, SensorModel
-from margcal.methods.affine import checked_readings, checked_rotations
+from margcal.methods.affine import checked_readings, checked_rotations, determinant3, inverse3, tangents
 from margcal.methods.one_step import one_step
 
-MAX_ITER = 40
-REML_ITER = 20
-"""Rounds in which the two components are estimated; the change of the last is far below their standard error."""
+MAX_ITER = 30
 STEP_TOL = 1e-6
 """Largest last step, in standard deviations of the unknowns."""
-START_S_ROT = np.radians(0.1)
+COMPONENT_TOL = 1e-4
+"""Largest last change of kappa^2 and s_rot^2, relative; their own standard error is 15 % and more."""
 MIN_S_ROT = 1e-7
+CLEAR = 2.0
+"""Twice the gain in log-likelihood from which s_rot counts as different from zero (chance: 8 %). An estimate that
+is not clear of zero is noise: taken at its word it would widen every covariance."""
 MIN_POSES = 6
+
+_Nodes = NDArray[np.bool_] | NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """n nodes: centred and scaled readings z and their noise (n, J, 3), rotations (n, J, 3, 3), weights (n, J)."""
+
+    z: Array
+    R: Array
+    noise: Array
+    weight: Array
+
+    def of(self, index: _Nodes) -> _Problem:
+        return _Problem(self.z[index], self.R[index], self.noise[index], self.weight[index])
 
 
 @dataclass(frozen=True)
 class _State:
-    """Centred and scaled: readings z = (y - centre) / size, |u| = 1."""
+    """Estimate of n nodes, |u| = 1."""
 
     A: Array
     b: Array
     u: Array
+    kappa2: Array
+    rot2: Array
+    converged: NDArray[np.bool_]
+
+    def of(self, index: _Nodes) -> _State:
+        return _State(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def with_nodes(self, index: _Nodes, other: _State) -> _State:
+        """This one, but `other` at the nodes `index`."""
+        columns = []
+        for name in self.__dataclass_fields__:
+            column = getattr(self, name).copy()
+            column[index] = getattr(other, name)
+            columns.append(column)
+        return _State(*columns)
 
 
 @dataclass(frozen=True)
 class _Linear:
     """The weighted problem linearised at a state."""
 
-    r: Array  # (..., J, 3)
-    X: Array  # (..., J, 3, 14), derivatives of the model y(A, b, u)
+    r: Array
+    X: Array
     S: Array
     S_inverse: Array
+    back: Array  # S^-1 X
     inverse: Array  # N^-1
     step: Array
     V_rot: Array  # dS / d(s_rot^2)
-    V_noise: Array  # dS / d(kappa^2)
+    log_likelihood: Array  # restricted, up to a constant; meant for where the step vanishes
 
 
 def gls_ml(
@@ -106,238 +140,268 @@ def gls_ml(
         kappa (raw unit where `noise_sd` was not given), `cofactor` (..., 14, 14) covariance of (A row by row, B,
         two components of u across it, calibrated unit), `tangent` (..., 3, 2) the directions of these two,
         `deletion` (..., J) the chi-square (3 degrees of freedom) by which the fit improves without each pose,
-        `predicted` (..., J, 3) reading minus prediction from the other poses, `chi2`, `dof`.
+        `predicted` (..., J, 3) reading minus prediction from the other poses, `chi2`, `dof`, `converged` (...,).
 
     Raises
     ------
     DataError
         With fewer than six poses, or (single node) poses that do not determine H.
+
+    Notes
+    -----
+    Where the noise must come from the misfits too, ten poses leave it 16 degrees of freedom, and the covariance
+    is as uncertain as that; give `noise_sd`.
     """
     y = checked_readings(y, kind, MIN_POSES)
     R = checked_rotations(R, y.shape[-2])
+    J = y.shape[-2]
     lead = np.broadcast_shapes(y.shape[:-2], R.shape[:-3], () if use is None else np.shape(use)[:-1])
-    y = np.broadcast_to(y, (*lead, *y.shape[-2:]))
-    counted = np.ones(y.shape[:-1], dtype=bool) if use is None else np.broadcast_to(np.asarray(use, bool), y.shape[:-1])
-    start = _start(y, R, counted, kind)
+    y = np.broadcast_to(y, (*lead, J, 3)).reshape(-1, J, 3)
+    R = np.broadcast_to(R, (*lead, J, 3, 3)).reshape(-1, J, 3, 3)
+    counted = np.broadcast_to(True if use is None else np.asarray(use, dtype=bool), (*lead, J)).reshape(-1, J)
+    noise = np.broadcast_to(1.0 if noise_sd is None else np.asarray(noise_sd, float), (*lead, J, 3)).reshape(-1, J, 3)
+    start = _start(y, R, counted, kind, single=not lead)
     centre, size = _scale(y, counted)
-    z = (y - centre[..., None, :]) / size[..., None, None]
-    noise = np.ones(y.shape) if noise_sd is None else np.broadcast_to(np.asarray(noise_sd, float), y.shape)
-    noise = noise / size[..., None, None]
-    weight = counted.astype(np.float64)
-    state = _State(
-        np.linalg.inv(start.model.H) / size[..., None, None],
-        (start.model.B - centre) / size[..., None],
-        np.asarray(start.u),
+    problem = _Problem(
+        (y - centre[:, None]) / size[:, None, None], R, noise / size[:, None, None], np.where(counted, 1.0, 0.0)
     )
-    kappa2 = np.ones(lead) if noise_sd is not None else _first_noise(z, R, state, weight, noise)
-    rot2 = np.full(lead, (START_S_ROT if s_rot is None else s_rot) ** 2)
-    free = np.array([noise_sd is None, s_rot is None])
-    converged, n_iter = np.zeros(lead, dtype=bool), 0
-    while n_iter < max_iter and not (converged.all() and not free.any()):
-        n_iter += 1
-        at = _linearise(z, R, state, kappa2, rot2, noise, weight)
-        moved = np.max(np.abs(at.step) / np.sqrt(np.diagonal(at.inverse, axis1=-2, axis2=-1)), axis=-1)
-        state = _moved(state, at.step)
-        converged = moved < STEP_TOL
-        if not free.any():
-            continue
-        new_kappa2, new_rot2, rot2_se = _reml(at, kappa2, rot2, weight, free)
-        least = np.mean(noise**2, axis=(-1, -2)) * kappa2
-        changed = np.maximum(np.abs(new_kappa2 / kappa2 - 1), np.abs(new_rot2 - rot2) / (rot2 + least))
-        kappa2, rot2 = new_kappa2, new_rot2
-        if n_iter >= REML_ITER or np.all(converged & (changed < 1e-4)):
-            # an s_rot that is not clear of zero is noise: taken at its word it would widen every covariance
-            rot2 = np.where(rot2 < rot2_se, MIN_S_ROT**2, rot2) if free[1] else rot2
-            free = np.zeros(2, dtype=bool)
-            converged = np.zeros(lead, dtype=bool)
-    at = _linearise(z, R, state, kappa2, rot2, noise, weight)
-    return _to_fit(
-        at, state, y, R, centre, size, magnitude, kappa2, rot2, converged, n_iter, kind, raw_unit, unit, weight
-    )
+    state = _first_state(problem, start, centre, size, noise_sd is None, s_rot)
+    state, n_iter = _solve(problem, state, (noise_sd is None, False), max_iter)
+    if s_rot is None:
+        state, more = _with_s_rot(problem, state, noise_sd is None, max_iter)
+        n_iter += more
+    found = _Found(problem, state, _linearise(problem, state), centre, size, magnitude, n_iter)
+    return _to_fit(found, y, kind, raw_unit, unit, lead)
 
 
-def _start(y: Array, R: Array, counted: Array, kind: Kind) -> Fit:
-    """One-step with |u| = 1; poses that do not count have weight zero."""
+def _start(y: Array, R: Array, counted: NDArray[np.bool_], kind: Kind, *, single: bool) -> Fit:
+    """One-step with |u| = 1; poses that do not count have next to no weight."""
     weights = None if counted.all() else np.where(counted, 1.0, 1e-12)
+    if single:  # it says what is missing where the poses do not determine H
+        one_step(y[0], R[0], 1.0, kind=kind, weights=None if weights is None else weights[0], covariance=False)
     return one_step(y, R, 1.0, kind=kind, weights=weights, covariance=False)
 
 
-def _scale(y: Array, counted: Array) -> tuple[Array, Array]:
+def _scale(y: Array, counted: NDArray[np.bool_]) -> tuple[Array, Array]:
     w = counted / counted.sum(axis=-1, keepdims=True)
-    centre = np.einsum("...j,...ji->...i", w, y)
-    size = np.sqrt(np.einsum("...j,...ji->...", w, (y - centre[..., None, :]) ** 2))
-    return centre, size
+    centre = np.einsum("nj,nji->ni", w, y)
+    return centre, np.sqrt(np.einsum("nj,nji->n", w, (y - centre[:, None]) ** 2))
 
 
-def _first_noise(z: Array, R: Array, state: _State, weight: Array, noise: Array) -> Array:
-    r = (z - state.b[..., None, :] - _predicted(state, R)) / noise
-    dof = np.maximum(3 * weight.sum(axis=-1) - 14, 1)
-    return np.maximum(np.einsum("...ji,...ji,...j->...", r, r, weight) / dof, 1e-24)
+def _first_state(p: _Problem, start: Fit, centre: Array, size: Array, free_noise: bool, s_rot: float | None) -> _State:
+    A, b = inverse3(start.model.H) / size[:, None, None], (start.model.B - centre) / size[:, None]
+    n = len(size)
+    rot2 = MIN_S_ROT**2 if s_rot is None else max(s_rot, MIN_S_ROT) ** 2
+    state = _State(A, b, np.asarray(start.u), np.ones(n), np.full(n, rot2), np.zeros(n, dtype=bool))
+    if not free_noise:
+        return state
+    r = _linearise(p, state).r / p.noise
+    dof = np.maximum(3 * p.weight.sum(axis=-1) - 14, 1)
+    return replace(state, kappa2=np.maximum(np.einsum("nji,nji,nj->n", r, r, p.weight) / dof, 1e-24))
 
 
-def _predicted(state: _State, R: Array) -> Array:
-    return np.einsum("...ab,...jbc,...c->...ja", state.A, R, state.u)
+def _solve(p: _Problem, state: _State, free: tuple[bool, bool], max_iter: int) -> tuple[_State, int]:
+    """Gauss-Newton, with a step of REML on the components (kappa^2, s_rot^2) that are `free` after each step."""
+    n_iter, active, now = 0, np.arange(len(p.z)), state
+    while n_iter < max_iter and len(active):
+        n_iter += 1
+        at = _linearise(p, now)
+        sd = np.sqrt(np.diagonal(at.inverse, axis1=-2, axis2=-1))
+        done = np.max(np.abs(at.step) / sd, axis=-1) < STEP_TOL
+        lost = ~np.isfinite(at.step).all(axis=-1)
+        if any(free):
+            kappa2, rot2 = _reml(p, at, now, free)
+            least = np.mean(p.noise**2, axis=(-1, -2)) * kappa2
+            change = np.abs(kappa2 / now.kappa2 - 1) + np.abs(rot2 - now.rot2) / (rot2 + least)
+            done &= change < COMPONENT_TOL
+            now = replace(now, kappa2=kappa2, rot2=rot2)
+        now = replace(_moved(now, at.step), converged=done & ~lost)
+        state = state.with_nodes(active, now)
+        if (left := ~(done | lost)).sum() < len(active):  # the others go on without those that are done
+            active, p, now = active[left], p.of(left), now.of(left)
+    return state, n_iter
 
 
-def _linearise(z: Array, R: Array, state: _State, kappa2: Array, rot2: Array, noise: Array, weight: Array) -> _Linear:
+def _with_s_rot(p: _Problem, null: _State, free_noise: bool, max_iter: int) -> tuple[_State, int]:
+    """The fit with s_rot estimated, at the nodes where its likelihood is clearly above that of `null`, s_rot = 0."""
+    at = _linearise(p, null)
+    score, info = _score(p, at, (free_noise, True))
+    worth = np.flatnonzero((score[:, 1] > 0) & null.converged)  # elsewhere the likelihood falls from zero on
+    if not len(worth):
+        return null, 0
+    first = np.maximum(score[worth, 1] / info[worth, 1, 1], MIN_S_ROT**2)
+    full, n_iter = _solve(p.of(worth), replace(null.of(worth), rot2=first), (free_noise, True), max_iter)
+    gain = 2 * (_linearise(p.of(worth), full).log_likelihood - at.log_likelihood[worth])
+    better = full.converged & (gain > CLEAR)
+    return null.with_nodes(worth[better], full.of(better)), n_iter
+
+
+def _linearise(p: _Problem, state: _State) -> _Linear:
     A, u = state.A, state.u
-    v = np.einsum("...jbc,...c->...jb", R, u)
-    r = z - state.b[..., None, :] - np.einsum("...ab,...jb->...ja", A, v)
-    X = np.zeros((*r.shape, 14))
+    n, J = p.weight.shape
+    v = (p.R @ u[:, None, :, None])[..., 0]
+    Av = v @ np.swapaxes(A, -1, -2)
+    r = p.z - state.b[:, None] - Av
+    X = np.zeros((n, J, 3, 14))
     for i in range(3):
         X[..., i, 3 * i : 3 * i + 3] = v
         X[..., i, 9 + i] = 1.0
-    X[..., 12:] = np.einsum("...ab,...jbc,...ck->...jak", A, R, _across(u))
-    G = np.einsum("...ab,...jbc->...jac", A, so3.skew(v))
-    V_rot = G @ np.swapaxes(G, -1, -2)
-    V_noise = noise[..., :, None] ** 2 * np.eye(3)
-    S = kappa2[..., None, None, None] * V_noise + rot2[..., None, None, None] * V_rot
-    S_inverse = np.linalg.inv(S)
-    XW = np.swapaxes(X, -1, -2) @ S_inverse * weight[..., None, None]
-    N = (XW @ X).sum(axis=-3)
+    X[..., 12:] = (A[:, None] @ p.R) @ tangents(u)[:, None]
+    # A [v]x [v]x^T A^T with |v| = 1
+    V_rot = (A @ np.swapaxes(A, -1, -2))[:, None] - Av[..., :, None] * Av[..., None, :]
+    S = state.rot2[:, None, None, None] * V_rot
+    S[..., range(3), range(3)] += state.kappa2[:, None, None] * p.noise**2
+    S_inverse = inverse3(S)
+    back = S_inverse @ X
+    weighted = (back * p.weight[..., None, None]).reshape(n, 3 * J, 14)
+    N = np.swapaxes(X.reshape(n, 3 * J, 14), -1, -2) @ weighted
     d = np.sqrt(np.diagonal(N, axis1=-2, axis2=-1))
-    inverse = np.linalg.inv(N / (d[..., :, None] * d[..., None, :])) / (d[..., :, None] * d[..., None, :])
-    g = np.einsum("...jpa,...ja->...p", XW, r)
-    return _Linear(r, X, S, S_inverse, inverse, np.einsum("...pq,...q->...p", inverse, g), V_rot, V_noise)
-
-
-def _across(u: Array) -> Array:
-    """Two unit vectors across each unit vector `u` (..., 3), as columns (..., 3, 2)."""
-    return np.swapaxes(np.linalg.svd(u[..., None, :])[2][..., 1:, :], -1, -2)
+    d = d[:, :, None] * d[:, None, :]
+    inverse = np.linalg.inv(N / d) / d
+    g = np.swapaxes(weighted, -1, -2) @ r.reshape(n, 3 * J, 1)
+    # inverse3 divides by the determinant, so |S| is safely positive here
+    log_S = np.einsum("nj,nj->n", np.log(determinant3(S)), p.weight)
+    square = np.einsum("nja,njab,njb,nj->n", r, S_inverse, r, p.weight, optimize=True)
+    log_likelihood = -0.5 * (log_S + np.linalg.slogdet(N)[1] + square)
+    return _Linear(r, X, S, S_inverse, back, inverse, (inverse @ g)[..., 0], V_rot, log_likelihood)
 
 
 def _moved(state: _State, step: Array) -> _State:
-    u = state.u + np.einsum("...ck,...k->...c", _across(state.u), step[..., 12:])
-    return _State(
-        state.A + step[..., :9].reshape(state.A.shape),
-        state.b + step[..., 9:12],
-        u / np.linalg.norm(u, axis=-1, keepdims=True),
-    )
+    u = state.u + (tangents(state.u) @ step[:, 12:, None])[..., 0]
+    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+    return replace(state, A=state.A + step[:, :9].reshape(-1, 3, 3), b=state.b + step[:, 9:12], u=u)
 
 
-def _reml(at: _Linear, kappa2: Array, rot2: Array, weight: Array, free: Array) -> tuple[Array, Array, Array]:
-    """One step of REML on (kappa^2, s_rot^2), kept positive, and the standard error of s_rot^2.
+def _score(p: _Problem, at: _Linear, free: tuple[bool, bool]) -> tuple[Array, Array]:
+    """Twice the score (n, 2) and information (n, 2, 2) of the restricted likelihood by (kappa^2, s_rot^2).
 
-    Score of a component with derivative V: (q' V q - tr P V) / 2 with q = S^-1 r; its information is the average of
-    the observed and the expected one, q' V P V q / 2 (Gilmour, Thompson & Cullis, Biometrics 51, 1995).
+    With V the derivative of S by a component and q = S^-1 r: score (q' V q - tr P V) / 2, and as information the
+    average of the observed and the expected one, q' V P V q / 2 (Gilmour, Thompson & Cullis, Biometrics 51, 1995).
     """
-    theta = np.stack([kappa2, rot2], axis=-1)
-    w = weight[..., None, None]
-    back = at.S_inverse @ at.X
-    q = np.einsum("...jab,...jb->...ja", at.S_inverse, at.r) * weight[..., None]
-    V = (at.V_noise, at.V_rot)
-    Vq = [np.einsum("...jab,...jb->...ja", v, q) for v in V]
-    to_N = [np.einsum("...jap,...ja->...p", back, x * weight[..., None]) for x in Vq]
-    diagonal = (at.S_inverse - back @ at.inverse[..., None, :, :] @ np.swapaxes(back, -1, -2)) * w
-    score, info = np.empty((*kappa2.shape, 2)), np.empty((*kappa2.shape, 2, 2))
-    for i in range(2):
-        score[..., i] = np.einsum("...ja,...ja->...", q, Vq[i]) - np.einsum("...jab,...jba->...", diagonal, V[i])
-        for k in range(2):
-            direct = np.einsum("...ja,...jab,...jb,...j->...", Vq[i], at.S_inverse, Vq[k], weight)
-            info[..., i, k] = direct - np.einsum("...p,...pq,...q->...", to_N[i], at.inverse, to_N[k])
-    info = np.where(free[:, None] & free, info, np.eye(2))
-    score = np.where(free, score, 0.0)
+    w = p.weight[..., None]
+    q = (at.S_inverse @ at.r[..., None])[..., 0] * w
+    Vq = (p.noise**2 * q, (at.V_rot @ q[..., None])[..., 0])
+    P = (at.S_inverse - (at.back @ at.inverse[:, None]) @ np.swapaxes(at.back, -1, -2)) * w[..., None]
+    trace = (
+        np.einsum("njaa,nja->n", P, p.noise**2),
+        np.einsum("njab,njba->n", P, at.V_rot),
+    )
+    to_N = [np.einsum("njap,nja->np", at.back, x * w) for x in Vq]
+    n = len(p.z)
+    score, info = np.zeros((n, 2)), np.zeros((n, 2, 2))
+    info[:] = np.eye(2)
+    for i in (i for i in range(2) if free[i]):
+        score[:, i] = np.einsum("nja,nja->n", q, Vq[i]) - trace[i]
+        for k in (k for k in range(2) if free[k]):
+            direct = np.einsum("nja,nja->n", Vq[i] * w, (at.S_inverse @ Vq[k][..., None])[..., 0])
+            info[:, i, k] = direct - np.einsum("np,npq,nq->n", to_N[i], at.inverse, to_N[k], optimize=True)
+    return score, info
+
+
+def _reml(p: _Problem, at: _Linear, state: _State, free: tuple[bool, bool]) -> tuple[Array, Array]:
+    """One step of REML on (kappa^2, s_rot^2), of at most a factor of five."""
+    score, info = _score(p, at, free)
     d = np.sqrt(np.maximum(np.diagonal(info, axis1=-2, axis2=-1), 1e-300))
-    inverse = np.linalg.inv(info / (d[..., :, None] * d[..., None, :]) + 1e-6 * np.eye(2)) / (
-        d[..., :, None] * d[..., None, :]
-    )
-    step = np.einsum("...ik,...k->...i", inverse, score)
+    scaled = info / (d[:, :, None] * d[:, None, :]) + 1e-6 * np.eye(2)
+    step = np.linalg.solve(scaled, (score / d)[..., None])[..., 0] / d
+    theta = np.stack([state.kappa2, state.rot2], axis=-1)
     new = np.where(free, np.clip(theta + step, 0.2 * theta, 5 * theta + 1e-12), theta)
-    new[..., 1] = np.maximum(new[..., 1], MIN_S_ROT**2)
-    return new[..., 0], new[..., 1], np.sqrt(2 * np.abs(inverse[..., 1, 1]))
+    return new[:, 0], np.maximum(new[:, 1], MIN_S_ROT**2)
 
 
-def _to_fit(
-    at: _Linear,
-    state: _State,
-    y: Array,
-    R: Array,
-    centre: Array,
-    size: Array,
-    magnitude: float,
-    kappa2: Array,
-    rot2: Array,
-    converged: Array,
-    n_iter: int,
-    kind: Kind,
-    raw_unit: str,
-    unit: str,
-    weight: Array,
-) -> Fit:
+@dataclass(frozen=True)
+class _Found:
+    """What the result is made of."""
+
+    problem: _Problem
+    state: _State
+    at: _Linear
+    centre: Array
+    size: Array
+    magnitude: float
+    n_iter: int
+
+
+def _to_fit(found: _Found, y: Array, kind: Kind, raw_unit: str, unit: str, lead: tuple[int, ...]) -> Fit:
+    state, at, size, magnitude = found.state, found.at, found.size, found.magnitude
     # sign: det H > 0 (conventions); (A, u) and (-A, -u) are the same fit
-    sign = np.where(np.linalg.det(state.A) < 0, -1.0, 1.0)
-    A = sign[..., None, None] * state.A * (size / magnitude)[..., None, None]
-    u = sign[..., None] * state.u * magnitude
-    H, B = np.linalg.inv(A), centre + size[..., None] * state.b
-    # unknowns in physical units: A scales by size / magnitude, b by size, u by magnitude
-    lead = size.shape
-    units = np.concatenate(
-        [
-            np.broadcast_to((sign * size / magnitude)[..., None], (*lead, 9)),
-            np.broadcast_to(size[..., None], (*lead, 3)),
-            np.full((*lead, 2), magnitude),
-        ],
-        axis=-1,
+    sign = np.where(determinant3(state.A) < 0, -1.0, 1.0)
+    A = state.A * (sign * size / magnitude)[:, None, None]
+    u = sign[:, None] * state.u * magnitude
+    H, B = inverse3(A), found.centre + size[:, None] * state.b
+    cofactor, covariance = _covariances(found, H, sign)
+    residual = np.linalg.norm(
+        (y - B[:, None]) @ np.swapaxes(H, -1, -2) - (found.problem.R @ u[:, None, :, None])[..., 0], axis=-1
     )
-    cofactor = at.inverse * units[..., :, None] * units[..., None, :]
-    to = np.zeros((*lead, 12, 12))
-    to[..., :9, :9] = -np.einsum("...ik,...lj->...ijkl", H, H).reshape(*lead, 9, 9)  # dH = -H dA H
-    to[..., 9:, 9:] = np.eye(3)
-    covariance = to @ cofactor[..., :12, :12] @ np.swapaxes(to, -1, -2)
-    off = (y - B[..., None, :]) @ np.swapaxes(H, -1, -2) - np.einsum("...jbc,...c->...jb", R, u)
-    residual = np.linalg.norm(off, axis=-1)
+    weight = found.problem.weight
     deletion, predicted = _deletion(at, weight)
-    chi2 = np.einsum("...ja,...jab,...jb,...j->...", at.r, at.S_inverse, at.r, weight)
+    chi2 = np.einsum("nja,njab,njb,nj->n", at.r, at.S_inverse, at.r, weight, optimize=True)
     details = {
-        "s_rot": np.sqrt(rot2),
-        "noise": np.sqrt(kappa2),
+        "s_rot": np.sqrt(state.rot2),
+        "noise": np.sqrt(state.kappa2),
         "cofactor": cofactor,
-        "tangent": _across(state.u) * sign[..., None, None],
+        "tangent": tangents(state.u) * sign[:, None, None],
         "deletion": deletion,
-        "predicted": predicted * size[..., None, None],
+        "predicted": predicted * size[:, None, None],
         "chi2": chi2,
         "dof": 3 * weight.sum(axis=-1) - 14,
+        "converged": state.converged,
     }
-    single = H.ndim == 2
-    if single:
-        _refuse_open(kind, covariance, A, magnitude)
-    rms = float(np.sqrt(np.mean(residual[weight > 0] ** 2))) if single else None
-    model = SensorModel(kind, H, B, raw_unit, unit, covariance if single else None, rms, y.shape[-2], "gls-ml")
-    bad = int((~converged).sum())
+    details = {name: np.reshape(value, (*lead, *value.shape[1:])) for name, value in details.items()}
+    if not lead:
+        _refuse_open(kind, covariance[0])
+    rms = None if lead else float(np.sqrt(np.mean(residual[weight > 0] ** 2)))
+    H, B, u, residual, covariance = (np.reshape(a, (*lead, *a.shape[1:])) for a in (H, B, u, residual, covariance))
+    model = SensorModel(kind, H, B, raw_unit, unit, None if lead else covariance, rms, y.shape[-2], "gls-ml")
+    condition = np.linalg.cond(H)
+    bad = int((~state.converged).sum())
     return Fit(
         model,
         residual,
-        float(chi2) if single else chi2,
+        details["chi2"] if lead else float(details["chi2"]),
         "gls-ml",
         "not in the papers: maximum likelihood with reading noise and housing-angle error",
         u=u,
         covariance=covariance,
         rank=14,
-        condition=np.linalg.cond(A) if not single else float(np.linalg.cond(A)),
-        n_iter=n_iter,
-        converged=bool(converged.all()),
+        condition=condition if lead else float(condition),
+        n_iter=found.n_iter,
+        converged=bad == 0,
         details=details,
-        text=f"{bad} of {converged.size} did not converge in {n_iter} iterations" if bad else "",
+        text=f"{bad} of {len(size)} did not converge in {found.n_iter} iterations" if bad else "",
     )
+
+
+def _covariances(found: _Found, H: Array, sign: Array) -> tuple[Array, Array]:
+    """Covariance (n, 14, 14) of (A, B, u) in physical units, and (n, 12, 12) of (H, B): dH = -H dA H."""
+    n, size, magnitude = len(H), found.size, found.magnitude
+    units = np.empty((n, 14))
+    units[:, :9] = (sign * size / magnitude)[:, None]
+    units[:, 9:12] = size[:, None]
+    units[:, 12:] = magnitude
+    cofactor = found.at.inverse * units[:, :, None] * units[:, None, :]
+    to = np.zeros((n, 12, 12))
+    to[:, :9, :9] = -np.einsum("nik,nlj->nijkl", H, H).reshape(n, 9, 9)
+    to[:, 9:, 9:] = np.eye(3)
+    C = to @ cofactor[:, :12, :12] @ np.swapaxes(to, -1, -2)
+    return cofactor, (C + np.swapaxes(C, -1, -2)) / 2
 
 
 def _deletion(at: _Linear, weight: Array) -> tuple[Array, Array]:
     """For each pose: chi-square of its misfit to the fit of the others, and that misfit (linearised, exact for
     the linear problem): with h = X N^-1 X^T, the predicted residual is (I - h S^-1)^-1 r."""
-    h = at.X @ at.inverse[..., None, :, :] @ np.swapaxes(at.X, -1, -2)
-    counted = weight[..., None, None]
-    Q = at.S - h * counted  # covariance of the residual within the fit
-    Q += 1e-12 * np.trace(at.S, axis1=-2, axis2=-1)[..., None, None] * np.eye(3)
-    within = np.linalg.solve(Q, at.r[..., None])[..., 0]
-    predicted = np.einsum("...jab,...jb->...ja", at.S, within)
-    outside = np.linalg.solve(at.S + h, at.r[..., None])[..., 0]  # of poses that were left out already
-    chi2 = np.where(
-        weight > 0, np.einsum("...ja,...ja->...j", at.r, within), np.einsum("...ja,...ja->...j", at.r, outside)
-    )
-    return chi2, np.where(weight[..., None] > 0, predicted, at.r)
+    h = (at.X @ at.inverse[:, None]) @ np.swapaxes(at.X, -1, -2)
+    inside = at.S - h  # covariance of the residual within the fit
+    inside = inside + 1e-12 * np.trace(at.S, axis1=-2, axis2=-1)[..., None, None] * np.eye(3)
+    counts = weight > 0
+    # of poses that were left out already, the residual is the prediction's misfit
+    Q = np.where(counts[..., None, None], inside, at.S + h)
+    Q_inverse_r = np.linalg.solve(Q, at.r[..., None])
+    predicted = np.where(counts[..., None], (at.S @ Q_inverse_r)[..., 0], at.r)
+    return np.einsum("nja,nja->nj", at.r, Q_inverse_r[..., 0]), predicted
 
 
-def _refuse_open(kind: Kind, covariance: Array, A: Array, magnitude: float) -> None:
+def _refuse_open(kind: Kind, covariance: Array) -> None:
     if np.isfinite(covariance).all() and np.all(np.diag(covariance) >= 0):
         return
     text = f"{kind}: the poses do not determine H; turn the housing about a second and a third axis"

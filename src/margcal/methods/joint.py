@@ -218,7 +218,7 @@ def joint_fit(
     while not converged and n_iter < max_iter:
         n_iter += 1
         N, g, parts = _normal(blocks, scale, layout.size)
-        inverse = _inverse(N)
+        inverse = _inverse(N, layout.R)
         state, blocks, step = _damped(data, state, blocks, scale, inverse @ g)
         moved = np.max(np.abs(step) / np.sqrt(np.maximum(np.diag(inverse), 1e-300)), initial=0.0)
         changed = 0.0
@@ -408,9 +408,14 @@ def _normal(blocks: Sequence[_Block], scale: Mapping[str, float], size: int) -> 
     return np.sum(list(parts.values()), axis=0), g, parts
 
 
-def _inverse(N: Array) -> Array:
-    """Pseudo-inverse of the scaled normal matrix: undetermined (gauge) directions stay where they are."""
+def _inverse(N: Array, angles: Array) -> Array:
+    """Pseudo-inverse of the scaled normal matrix: undetermined (gauge) directions stay where they are.
+
+    `angles` are the columns of the rests' attitudes. All have one unit, so one that is nothing but rounding (a heading
+    that nobody knows, about a housing axis that points up exactly) must not be scaled up to look determined.
+    """
     d = np.sqrt(np.maximum(np.diag(N), 1e-300))
+    d[angles] = np.maximum(d[angles], 1e-6 * np.max(d[angles], initial=0.0))
     values, vectors = np.linalg.eigh(N / np.outer(d, d))
     good = values > 1e-12 * values[-1]
     scaled = vectors[:, good] / d[:, None]
@@ -508,7 +513,7 @@ def _result(
 ) -> JointFit:
     triads, gyro, layout = data.triads, data.gyro, data.layout
     N, _, parts = _normal(blocks, scale, layout.size)
-    inverse = _inverse(N)
+    inverse = _inverse(N, layout.R)
     H: dict[Kind, Array] = {}
     covariance: dict[Kind, Array] = {}
     residual: dict[Kind, Array] = {}

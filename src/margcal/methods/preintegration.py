@@ -32,6 +32,7 @@ Z-TIE's quaternions are scalar last (53); here they are scalar first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -278,21 +279,41 @@ def _in_chunks(y: Array, dt: Array, H: Array, B: Array, sd: ArrayLike | None) ->
     return Preintegrated(dR, J_H, J_B, C)
 
 
+_SERIES = np.array(
+    [[(-1) ** k / math.factorial(2 * k + first) for k in range(6)] for first in (1, 2, 3)], dtype=np.float64
+)
+"""Coefficients in the squared angle of sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3."""
+
+
+def _sinc_terms(square: Array) -> Array:
+    """The three functions of `so3.sinc_terms`, stacked, from the squared angle; by series where that is exact."""
+    if square.size and square.max() > 0.1:
+        return np.stack(so3.sinc_terms(np.sqrt(square)))
+    # what is left out is below angle^12 / 13! < 2e-16
+    coefficients = _SERIES.reshape(3, 6, *[1] * square.ndim)
+    total = coefficients[:, 5] * square
+    for k in (4, 3, 2, 1):
+        total += coefficients[:, k]
+        total *= square
+    total += coefficients[:, 0]
+    return total
+
+
 def _exp_and_jacobian(phi: Array) -> tuple[Array, Array]:
-    """exp and left Jacobian of rotation vectors (..., 3), written out by components for speed (see `so3.exp`)."""
+    """exp and left Jacobian of rotation vectors (..., 3), both at once by components, for speed (see `so3`)."""
     x, y, z = phi[..., 0].copy(), phi[..., 1].copy(), phi[..., 2].copy()
-    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
-    s, c, d = so3.sinc_terms(np.sqrt(xx + yy + zz))
-    E, J = np.empty((*x.shape, 3, 3)), np.empty((*x.shape, 3, 3))
+    xx, yy, zz = x * x, y * y, z * z
+    terms = _sinc_terms(xx + yy + zz)
     # I + s [v]x + c [v]x^2 and I + c [v]x + d [v]x^2
-    for out, first, second in ((E, s, c), (J, c, d)):
-        fx, fy, fz = first * x, first * y, first * z
-        mixed = second * xy
-        out[..., 0, 1], out[..., 1, 0] = mixed - fz, mixed + fz
-        mixed = second * xz
-        out[..., 0, 2], out[..., 2, 0] = mixed + fy, mixed - fy
-        mixed = second * yz
-        out[..., 1, 2], out[..., 2, 1] = mixed - fx, mixed + fx
-        out[..., 0, 0], out[..., 1, 1] = 1 - second * (yy + zz), 1 - second * (xx + zz)
-        out[..., 2, 2] = 1 - second * (xx + yy)
-    return E, J
+    first, second = terms[:2], terms[1:]
+    out = np.empty((2, *x.shape, 3, 3))
+    fx, fy, fz, sx = first * x, first * y, first * z, second * x
+    mixed = sx * y
+    out[..., 0, 1], out[..., 1, 0] = mixed - fz, mixed + fz
+    mixed = sx * z
+    out[..., 0, 2], out[..., 2, 0] = mixed + fy, mixed - fy
+    mixed = second * (y * z)
+    out[..., 1, 2], out[..., 2, 1] = mixed - fx, mixed + fx
+    out[..., 0, 0], out[..., 1, 1] = 1 - second * (yy + zz), 1 - second * (xx + zz)
+    out[..., 2, 2] = 1 - second * (xx + yy)
+    return out[0], out[1]

@@ -25,8 +25,8 @@ from margcal.workflow.assemble import assemble
 from margcal.workflow.checks import verdict_of
 from margcal.workflow.decide import decide
 from margcal.workflow.job import NAMES, Job, Options, Solved
-from margcal.workflow.lint import lint
-from margcal.workflow.segment import Segmentation, find_poses, measure_spans
+from margcal.workflow.lint import clipped, lint
+from margcal.workflow.segment import Segmentation, find_poses, measure_spans, measured
 from margcal.workflow.swing import swing_only, try_swing
 
 if TYPE_CHECKING:
@@ -98,9 +98,10 @@ def calibrate(
     options = _options(recordings, sensors, method, gravity, field, place, level_sd_deg, nominal)
     issues = [i for r in recordings for i in r.issues] + [i for r in recordings for i in lint(r)]
     lame = {i.sensor for i in issues if i.level == "fail"}
-    usable = tuple(replace(r, **{k: None for k in lame if k}) for r in recordings)
+    usable = tuple(measured(replace(r, **{k: None for k in lame if k})) for r in recordings)
     options = replace(options, sensors=tuple(k for k in options.sensors if k not in lame))
     job = _job(usable, poses, options, level, issues)
+    issues = _without_harmless(job, issues)
     solved = _solve(job, auto=poses == "auto")
     calibration = assemble(job, solved, issues, keep_failed=allow_fail)
     calibration = replace(
@@ -207,6 +208,19 @@ def _solve(job: Job, *, auto: bool) -> Solved:
     if auto:
         try_swing(job, solved)
     return solved
+
+
+def _without_harmless(job: Job, issues: list[Issue]) -> list[Issue]:
+    """Saturated samples outside every rest and turn had no part in the fit: worth a note, no warning."""
+    streams = [(i, r.gyr) for i, r in enumerate(job.recordings) if r.gyr is not None]
+    poses = job.segmentation.poses
+    for index, stream in streams:
+        at = stream.t[clipped(stream.y, stream)]
+        spans = [(t.t[0], t.t[-1]) for t in job.segmentation.turns if poses.recording[t.before] == index]
+        if any(((at >= a) & (at <= b)).any() for a, b in spans):
+            return issues
+    harmless = [i for i in issues if i.code == "saturated" and i.sensor == "gyr" and i.level == "warn"]
+    return [replace(i, level="note") if i in harmless else i for i in issues]
 
 
 def _segment(recordings: tuple[Recording, ...], poses: str | PoseTable) -> Segmentation:

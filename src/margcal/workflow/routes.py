@@ -318,6 +318,9 @@ def _attitudes_by_gyro(job: Job, solved: Solved, v: Array) -> tuple[Array, Array
 def _mag_by_attitudes(job: Job, R: Array, piece: Array, v: Array) -> Fit:
     """One-step on the longest chain that the gyroscope holds together; without one, by the constant dip."""
     y, index = job.readings("mag")
+    if not len(index):
+        text = "magnetometer: it was read at no rest; record it while the node lies still, or wave the node about"
+        raise DataError(text, (Issue("no-rest", "fail", text, "mag"),))
     numbers, counts = np.unique(piece[index], return_counts=True)
     longest = index[piece[index] == numbers[np.argmax(counts)]]
     magnitude = job.options.magnitude["mag"]

@@ -90,7 +90,7 @@ def find_poses(*recordings: Recording) -> Segmentation:
         `poses` may be empty: a swing has none. Nothing is integrated across recordings.
     """
     tables, turns, issues, offset = [], [], [], 0
-    for index, recording in enumerate(recordings):
+    for index, recording in enumerate(map(measured, recordings)):
         rests, held = _find_rests(recording)
         tables.append(_measure(recording, rests, index))
         found, noted = _find_turns(recording, rests, offset)
@@ -109,6 +109,16 @@ def find_poses(*recordings: Recording) -> Segmentation:
             issues.append(Issue("knocked-rest", "note", text, value=float(len(knocked))))
         offset += len(rests)
     return Segmentation(_pool(tables), tuple(turns), tuple(issues))
+
+
+def measured(recording: Recording) -> Recording:
+    """The recording without rows in which nothing was measured (NaN); they become gaps in time."""
+    kept: dict[str, Stream | None] = {}
+    for kind, stream in recording.streams.items():
+        seen = np.isfinite(stream.y).all(axis=1)
+        if not seen.all():
+            kept[kind] = replace(stream, t=stream.t[seen], y=stream.y[seen]) if seen.sum() > 1 else None
+    return replace(recording, **kept) if kept else recording
 
 
 # --- stillness ---------------------------------------------------------------------------------------
@@ -387,7 +397,7 @@ def measure_spans(recordings: Sequence[Recording], spans: Sequence[tuple[int, fl
     Used for ``--poses FILE`` with ``start_s stop_s``: nothing is searched for, the spans are taken as they are.
     """
     tables, turns, issues, offset = [], [], [], 0
-    for index, recording in enumerate(recordings):
+    for index, recording in enumerate(map(measured, recordings)):
         rests = [_Rest(((a, b),)) for i, a, b in spans if i == index]
         tables.append(_measure(recording, rests, index))
         found, noted = _find_turns(recording, rests, offset)
