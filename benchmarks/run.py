@@ -2,7 +2,7 @@
 
 NAME is the middle of a file's name: `apply` for bench_apply.py. Each is a process of its own and prints ratios of
 what it holds side by side in one run. Output is shown as it comes and kept in benchmarks/results/; with --json the
-results come as one JSON object instead. The exit status is 1 if a benchmark could not be run.
+results come as one JSON object instead (of a benchmark that prints no JSON, its lines). The exit status is 1 if a benchmark could not be run.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main() -> int:
         text, status = run(name, options.json)
         failed |= status != 0
         if options.json:
-            results[name] = json.loads(text) if status == 0 else None
+            results[name] = None if status else json.loads(text) if text.startswith("{") else text.splitlines()
     if options.json:
         print(json.dumps({"machine": machine, "results": results}, indent=2))
     return int(failed)
@@ -44,7 +44,9 @@ def main() -> int:
 
 def run(name: str, as_json: bool) -> tuple[str, int]:
     """Output and exit status of one benchmark; shown line by line unless it is JSON."""
-    command = [sys.executable, str(HERE / f"bench_{name}.py"), *(["--json"] if as_json else [])]
+    file = HERE / f"bench_{name}.py"
+    options = ["--json"] if as_json and '"--json"' in file.read_text(encoding="utf-8") else []
+    command = [sys.executable, str(file), *options]
     if not as_json:
         print(f"\n== {name}", flush=True)
     start, lines = time.perf_counter(), []

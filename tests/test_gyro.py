@@ -60,7 +60,7 @@ def simulate(
     size = rng.uniform(*angle, size=n_turns)[:, None, None]
     u = size / duration * axis[:, None] * (1 - np.cos(2 * np.pi * s))[:, None]
     u = u + wobble * rng.normal(size=(n_turns, 1, 3)) * np.sin(2 * np.pi * s)[:, None]
-    start = Rotation.random(n_turns, rng=np.random.default_rng(seed))
+    start = Rotation.random(n_turns, seed)
     attitude, along, branch = start, [], np.tile([1.0, 0, 0, 0], (n_turns, 1))
     for i in range(n):
         step = Rotation.from_rotvec(u[:, i] * dt)
@@ -292,7 +292,7 @@ def test_numbers_that_do_not_match_are_refused():
 
 
 def test_known_rotations_take_components_from_after_to_before():
-    R = Rotation.random(3, rng=np.random.default_rng(0))
+    R = Rotation.random(3, 0)
     turns = [
         Turn(0, 1, np.zeros(1), np.zeros((1, 3)), np.ones(1)),
         Turn(2, 0, np.zeros(1), np.zeros((1, 3)), np.ones(1)),
@@ -351,7 +351,7 @@ def test_gravity_errors_have_the_stated_covariance_with_one_and_two_directions()
         for seed, world in list(enumerate(worlds)) * 10:
             before, after = world.up_before[:, None], world.up_after[:, None]
             if several:
-                start = Rotation.random(16, rng=np.random.default_rng(seed))
+                start = Rotation.random(16, seed)
                 m_before = start.inv().apply(field)
                 m_after = np.einsum("tji,tj->ti", world.dR, m_before)
                 before, after = (np.stack(pair, 1) for pair in ((before[:, 0], m_before), (after[:, 0], m_after)))

@@ -134,6 +134,7 @@ class JointFit:
     redundancy: dict[str, float]
     residual: dict[Kind, Array]
     deletion: dict[str, Array]
+    shift: dict[Kind, Array]
     s_rot: float | None
     state: _State
     inverse: Array
@@ -519,13 +520,13 @@ def _result(
     residual: dict[Kind, Array] = {}
     for kind in triads:
         H[kind] = np.linalg.inv(state.A[kind])
-        covariance[kind] = _model_covariance(layout, inverse, kind, H[kind], forward=True)
+        covariance[kind] = _model_covariance(layout, inverse, kind, H[kind])
         v = np.einsum("jba,b->ja", state.R, state.u[kind])
         off = (triads[kind].y - state.B[kind]) @ H[kind].T - v
         residual[kind] = np.linalg.norm(off, axis=-1)
     if gyro is not None:
         H["gyr"] = state.A["gyr"]
-        covariance["gyr"] = _model_covariance(layout, inverse, "gyr", H["gyr"], forward=False)
+        covariance["gyr"] = _model_covariance(layout, inverse, "gyr", H["gyr"])
         dR = integrate(gyro.turns.y, gyro.turns.dt, H["gyr"], state.B["gyr"])
         net = np.swapaxes(state.R[gyro.before], -1, -2) @ state.R[gyro.after]
         residual["gyr"] = so3.angle_between(dR, net)
@@ -541,6 +542,7 @@ def _result(
         residual=residual,
         deletion={b.name: _deletion(b, _sigma(b.name, scale), inverse) for b in blocks},
         s_rot=_sigma("rot", scale) if data.priors.R0 is not None else None,
+        shift=_shifts(layout, blocks, scale, inverse, H),
         state=state,
         inverse=inverse,
         cost=_cost(blocks, scale),
@@ -550,16 +552,47 @@ def _result(
     )
 
 
-def _model_covariance(layout: _Layout, inverse: Array, kind: Kind, H: Array, *, forward: bool) -> Array:
-    """Covariance of (H row by row, then B) from that of (A, B): dH = -H dA H."""
-    columns = np.r_[layout.A[kind], layout.B[kind]]
+def _columns(layout: _Layout, kind: Kind) -> Array:
+    return np.r_[layout.A[kind], layout.B[kind]]
+
+
+def _to_model(layout: _Layout, kind: Kind, H: Array) -> Array:
+    """Derivatives (12, n) of (H row by row, then B) by the sensor's unknowns: dH = -H dA H; the gyroscope's are H."""
     n = len(layout.mask[kind])
     to = np.zeros((12, n + 3))
-    full = -np.kron(H, H.T) if forward else np.eye(9)
+    full = np.eye(9) if kind == "gyr" else -np.kron(H, H.T)
     to[:9, :n] = full[:, layout.mask[kind]]
     to[9:, n:] = np.eye(3)
+    return to
+
+
+def _model_covariance(layout: _Layout, inverse: Array, kind: Kind, H: Array) -> Array:
+    """Covariance (12, 12) of (H row by row, then B)."""
+    columns, to = _columns(layout, kind), _to_model(layout, kind, H)
     C = to @ inverse[np.ix_(columns, columns)] @ to.T
     return (C + C.T) / 2
+
+
+def _shifts(
+    layout: _Layout,
+    blocks: Sequence[_Block],
+    scale: Mapping[str, float],
+    inverse: Array,
+    H: Mapping[Kind, Array],
+) -> dict[Kind, Array]:
+    """How far (H row by row, B) of each sensor moves when a rest is left out, (J, 12), to first order: with the
+    rest's rows J_j, r_j the unknowns move by ``N^-1 J_j^T (I - J_j N^-1 J_j^T)^-1 r_j``."""
+    n = len(layout.R)
+    moved = np.zeros((n, layout.size))
+    at_rest = [b for b in blocks if b.name in ("acc", "mag", "rot", "level")]
+    for j in range(n):
+        rows = [(b, b.rest == j, _sigma(b.name, scale)) for b in at_rest]
+        r = np.concatenate([b.r[k] / s for b, k, s in rows])
+        J = np.concatenate([b.J[k] / s for b, k, s in rows])
+        values, vectors = np.linalg.eigh(np.eye(len(r)) - J @ inverse @ J.T)
+        along = np.where(values > CHECKABLE, (vectors.T @ r) / np.maximum(values, CHECKABLE), 0.0)
+        moved[j] = inverse @ J.T @ (vectors @ along)
+    return {kind: moved[:, _columns(layout, kind)] @ _to_model(layout, kind, H[kind]).T for kind in H}
 
 
 def _deletion(block: _Block, sigma: float, inverse: Array) -> Array:

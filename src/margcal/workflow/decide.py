@@ -52,7 +52,7 @@ def decide(
     has_mag = any("mag" in r.streams for r in recordings)
     if mode == "auto" and has_mag and (n == 0 or (n < MIN_TURNS and "acc" not in options.sensors)):
         return Attitudes("swing", "acc-triangular", text=f"{n} rests: taken as a swing of the magnetometer")
-    text = f"{n} rests in attitudes that nobody told: free"
+    text = f"{n} rests in unknown attitudes"
     return Attitudes("free", "acc-triangular", text=text)
 
 

@@ -319,7 +319,10 @@ def _mag_by_attitudes(job: Job, R: Array, piece: Array, v: Array) -> Fit:
     """One-step on the longest chain that the gyroscope holds together; without one, by the constant dip."""
     y, index = job.readings("mag")
     if not len(index):
-        text = "magnetometer: it was read at no rest; record it while the node lies still, or wave the node about"
+        text = (
+            "magnetometer: it was read at no rest; record it while the node lies still, or wave the node about with "
+            "magnetometer and gyroscope recorded together"
+        )
         raise DataError(text, (Issue("no-rest", "fail", text, "mag"),))
     numbers, counts = np.unique(piece[index], return_counts=True)
     longest = index[piece[index] == numbers[np.argmax(counts)]]
@@ -333,6 +336,8 @@ def _mag_by_attitudes(job: Job, R: Array, piece: Array, v: Array) -> Fit:
 
 def _mag_by_dip(job: Job, y: Array, v: Array) -> Fit:
     fit = by_magnitude.ellipsoid(y, job.options.magnitude["mag"], **job.as_named("mag"))
+    both = np.isfinite(v).all(axis=1)  # rests at which the accelerometer was read too
+    y, v = y[both], v[both]
     unit = fit.model.apply(y) / job.options.magnitude["mag"]
     Omega = rotation_from_dip(unit, v / np.linalg.norm(v, axis=1, keepdims=True))
     if Omega is None:
@@ -448,6 +453,7 @@ def adopt(solved: Solved, joint: JointFit) -> None:
             covariance=C,
             u=joint.u.get(kind),
             n_iter=joint.n_iter,
+            details={"leave_one_out": joint.shift[kind]},
             method="gls-ml",
             cites="not in the papers: joint maximum likelihood, see margcal.methods.joint",
         )

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from margcal.core import so3
+from margcal.core.errors import UsageError
 from margcal.core.types import Array, Issue, Kind, Poses, Recording, Stream, Turn
 
 MIN_REST_S = 1.0
@@ -89,6 +90,8 @@ def find_poses(*recordings: Recording) -> Segmentation:
     Segmentation
         `poses` may be empty: a swing has none. Nothing is integrated across recordings.
     """
+    if not recordings:
+        raise UsageError("no recording to find rests in")
     tables, turns, issues, offset = [], [], [], 0
     for index, recording in enumerate(map(measured, recordings)):
         rests, held = _find_rests(recording)
@@ -183,8 +186,10 @@ def _watched(recording: Recording) -> list[Stream]:
 def _still(recording: Recording, floors: Floors, ratio: float) -> tuple[Array, Array]:
     """Grid (s) and whether the node was still there, by every stream that tells motion."""
     streams = _watched(recording)
-    start = max(s.t[0] for s in streams)
-    stop = min(s.t[-1] for s in streams)
+    start = max((s.t[0] for s in streams), default=0.0)
+    stop = min((s.t[-1] for s in streams), default=0.0)
+    if stop - start < WINDOW_S:
+        return np.zeros(0), np.zeros(0, dtype=bool)
     grid = np.arange(start + WINDOW_S / 2, stop - WINDOW_S / 2 + 1e-9, STEP_S)
     still = np.ones(len(grid), dtype=bool)
     for stream in streams:
