@@ -2,7 +2,8 @@
 
 NAME is the middle of a file's name: `apply` for bench_apply.py. Each is a process of its own and prints ratios of
 what it holds side by side in one run. Output is shown as it comes and kept in benchmarks/results/; with --json the
-results come as one JSON object instead (of a benchmark that prints no JSON, its lines). The exit status is 1 if a benchmark could not be run.
+results come as one JSON object instead (of a benchmark that prints no JSON, its lines). The exit status is 1 if a
+benchmark could not be run.
 """
 
 from __future__ import annotations

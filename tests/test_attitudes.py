@@ -175,7 +175,7 @@ def test_too_few_rests_tell_no_headings():
 
 def test_labels_of_many_nodes_from_pose_means():
     """Accelerometer, magnetometer and turns together, as `cube` has them: >= 99 % of nodes, here all of them."""
-    for seed in range(24):
+    for seed in range(16):
         label, R, rng = put_down(seed)
         H, B = node(rng, 5.0)
         faces = att.find_faces(means(R, np.array([0, 0, G]), H, B, 0.3, rng))

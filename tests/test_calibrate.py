@@ -54,6 +54,12 @@ def cube(seed: int = 0, **options) -> Simulation:
     return simulate(seed=seed, **options)
 
 
+@cache
+def plain(seed: int = 0) -> Calibration:
+    """The cube's calibration with nothing told."""
+    return calibrate(cube(seed).recording)
+
+
 def transformed(sim: Simulation, matrices: dict) -> Simulation:
     """The same node with raw axes `matrices[kind]` times what they were."""
     streams, models = {}, {}
@@ -135,7 +141,7 @@ def _scaled(C):
 
 
 def test_unit_of_the_magnetometer_without_a_field_is_the_local_field():
-    calibration = calibrate(cube(0).recording)
+    calibration = plain()
     assert calibration.mag.unit == "norm"
     assert np.linalg.norm(calibration.mag.reference_vector) == pytest.approx(1.0)
     known = calibrate(cube(0).recording, field=49.1)
@@ -143,7 +149,7 @@ def test_unit_of_the_magnetometer_without_a_field_is_the_local_field():
 
 
 def test_gravity_is_a_pure_scale():
-    a, b = calibrate(cube(0).recording), calibrate(cube(0).recording, gravity=9.78)
+    a, b = plain(), calibrate(cube(0).recording, gravity=9.78)
     assert pytest.approx(a.acc.H, rel=1e-5, abs=1e-8) == b.acc.H * 9.80665 / 9.78
     assert b.settings["gravity"] == 9.78
     assert calibrate(cube(0).recording, place=LONDON).settings["gravity"] == LONDON.gravity
@@ -230,6 +236,16 @@ def test_a_sensor_may_be_missing_in_some_recordings():
     assert set(calibration.models) == set(KINDS)
     assert (calibration.acc.n_poses, calibration.mag.n_poses) == (32, 16)
     assert worst(a, calibration) < 0.15
+
+
+def test_a_magnetometer_recorded_apart_from_the_accelerometer_is_refused_with_a_reason():
+    """Nothing tells its rotation to the other sensors: at its rests nobody knows where up was."""
+    inertial = simulate(seed=2, node_seed=1, poses="free", n_poses=16, sensors=("acc", "gyr"), rest_s=3.0)
+    magnetic = simulate(seed=3, node_seed=1, poses="free", n_poses=16, sensors=("mag",), rest_s=3.0)
+    calibration = calibrate(inertial.recording, magnetic.recording)
+    assert {"acc", "gyr"} <= set(calibration.models)
+    assert calibration.mag is None or calibration.mag.expected_error_deg is None
+    assert [i for i in calibration.issues if i.sensor == "mag" and i.level in ("warn", "fail")]
 
 
 @pytest.mark.parametrize("poses", ["cube", "free"])
@@ -348,7 +364,7 @@ def test_other_orders_of_raw_axes_change_nothing():
     """Of gyroscope and magnetometer: the housing's axes are named after the accelerometer's."""
     sim = cube(2)
     P = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    base, other = calibrate(sim.recording), calibrate(transformed(sim, {"gyr": P, "mag": P}).recording)
+    base, other = plain(2), calibrate(transformed(sim, {"gyr": P, "mag": P}).recording)
     for kind in KINDS:
         M = np.eye(3) if kind == "acc" else P
         scale = np.abs(base.models[kind].H).max()
@@ -568,6 +584,17 @@ def test_no_reference_where_one_was_asked_for():
 def test_a_wrong_call_is_a_usage_error_that_names_it(options, words):
     with pytest.raises(UsageError, match=words):
         calibrate(cube(0).recording, **options)
+
+
+@pytest.mark.parametrize("value", ["stuck", "nan"])
+def test_nothing_but_dead_sensors(value):
+    sim = cube(0, n_poses=8, rest_s=2.0)
+    dead = {
+        k: replace(s, y=np.broadcast_to(s.y[0] if value == "stuck" else np.nan, s.y.shape))
+        for k, s in sim.recording.streams.items()
+    }
+    with pytest.raises(DataError, match="accelerometer"):
+        calibrate(replace(sim.recording, **dead))
 
 
 def test_no_recording_is_a_usage_error():

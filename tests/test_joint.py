@@ -219,7 +219,7 @@ def test_cost_is_chi_square_of_the_redundancy(many):
     cost = np.array([fit.cost for _, fit in many])
     dof = np.array([fit.dof for _, fit in many])
     # the components make every kind's cost equal to its redundancy, but where the least value of one holds it up
-    assert np.median(cost / dof) == pytest.approx(1, abs=0.02)
+    assert np.median(cost / dof) == pytest.approx(1, abs=0.05)
     assert np.all((cost / dof > 0.85) & (cost / dof < 1.02))
     rows = 20 * 3 * 4 + 19 * 3
     unknowns = 3 * 12 + 2 * 2 + 20 * 3

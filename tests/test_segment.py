@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from margcal.core import so3
+from margcal.core.errors import UsageError
 from margcal.core.types import Recording, Stream
 from margcal.workflow.segment import drop_poses, find_poses, measure_spans, noise_floor
 from margcal.workflow.simulate import Simulation, simulate, swing
@@ -325,3 +326,17 @@ def test_a_coarse_sensor_has_the_floor_of_its_last_bit():
 def test_too_short_a_stream_has_no_noise_floor():
     stream = on_table(0.5).acc
     assert np.isnan(noise_floor(stream))
+
+
+# --- nothing to find ---------------------------------------------------------------------------------
+
+
+def test_clocks_that_do_not_overlap_and_streams_of_nothing_have_no_rests():
+    recording = on_table(10.0)
+    late = replace(recording, gyr=replace(recording.gyr, t=recording.gyr.t + 1000))
+    assert len(find_poses(late).poses) == 0
+    blank = {k: replace(s, y=np.full(s.y.shape, np.nan)) for k, s in recording.streams.items()}
+    assert len(find_poses(replace(recording, **blank)).poses) == 0
+    assert len(find_poses(Recording()).poses) == 0
+    with pytest.raises(UsageError):
+        find_poses()

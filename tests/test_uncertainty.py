@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from margcal.core import so3
-from margcal.methods.uncertainty import direction_errors_deg, expected_error, sphere
+from margcal.methods.uncertainty import (
+    direction_ellipses,
+    direction_errors_deg,
+    expected_error,
+    heading_error,
+    relative_covariance,
+    shift_deg,
+    sphere,
+)
 
 H = (
     0.005
@@ -90,3 +98,91 @@ def test_direction_errors_of_closed_forms():
     assert direction_errors_deg(-H, B, H, B, G) == pytest.approx(np.full(len(u), 180.0))
     assert direction_errors_deg(H, B + 5, H, B, None) == pytest.approx(np.zeros(len(u)), abs=1e-5)
     assert direction_errors_deg(H, B + 5, H, B, G).max() > 0.1
+
+
+def test_the_worst_direction_is_where_it_says():
+    found = expected_error("mag", H, covariance(3), 49.0)
+    C = relative_covariance("mag", H, covariance(3), 49.0, np.array([found.worst_towards]))[0]
+    u = np.array(found.worst_towards)
+    assert np.degrees(np.sqrt(np.trace(C) - u @ C @ u)) == pytest.approx(found.worst_direction_deg)
+
+
+@pytest.mark.parametrize("kind", ["acc", "gyr"])
+def test_ellipses_hold_the_direction_errors(kind):
+    C, u = covariance(6), sphere(26)
+    axes = direction_ellipses(kind, H, C, G, u)
+    assert np.einsum("nki,ni->nk", axes, u) == pytest.approx(np.zeros((26, 2)), abs=1e-9)  # across
+    assert np.sum(axes[:, 0] * axes[:, 1], axis=1) == pytest.approx(np.zeros(26), abs=1e-12)
+    assert (np.linalg.norm(axes[:, 0], axis=1) >= np.linalg.norm(axes[:, 1], axis=1)).all()
+    # drawn errors along each semi-axis have its length for their standard deviation
+    drawn = np.random.default_rng(7).multivariate_normal(np.zeros(12), C, size=2000)
+    z = G * u @ np.linalg.inv(H).T
+    e = np.einsum("dij,nj->dni", drawn[:, :9].reshape(-1, 3, 3), z)
+    e = (e - (0 if kind == "gyr" else drawn[:, None, 9:] @ H.T)) / G
+    size = np.linalg.norm(axes, axis=2)
+    along = np.einsum("dni,nki->dnk", e, axes / size[:, :, None])
+    assert np.std(along, axis=0) == pytest.approx(size, rel=0.08)
+
+
+def test_shift_is_the_rms_angle_of_a_small_change():
+    rng = np.random.default_rng(8)
+    shift = rng.normal(size=(5, 12)) * np.r_[np.full(9, 1e-6), np.full(3, 1.0)]
+    for kind, magnitude in (("acc", G), ("gyr", None)):
+        found = shift_deg(kind, H, shift, G)
+        for d, angle in zip(shift, found):
+            exact = direction_errors_deg(H + d[:9].reshape(3, 3), B + d[9:], H, B, magnitude)
+            assert angle == pytest.approx(np.sqrt(np.mean(exact**2)), rel=5e-3)
+
+
+# --- heading -----------------------------------------------------------------------------------------
+
+H_MAG = 0.1 * so3.exp([3.0, 0.1, -0.2]) @ np.diag([1.05, 0.93, 1.01])
+FIELD = 49.0
+
+
+def _rotation_covariance(sd):
+    """Of the accelerometer's and the magnetometer's (H, B), (24, 24): one turn of the common frame."""
+    J = np.zeros((24, 3))
+    J[:9] = np.stack([(so3.skew(e) @ H).ravel() for e in np.eye(3)], axis=1)
+    J[12:21] = np.stack([(so3.skew(e) @ H_MAG).ravel() for e in np.eye(3)], axis=1)
+    return sd**2 * J @ J.T
+
+
+def _heading(C, dip, between=True):
+    return heading_error((H, C[:12, :12]), (H_MAG, C[12:, 12:]), G, FIELD, dip, C[12:, :12] if between else None)
+
+
+@pytest.mark.parametrize("dip_deg", [0.0, 60.0, -75.0])
+def test_a_turn_of_the_common_frame_turns_the_heading_by_itself(dip_deg):
+    """At any dip: what the two sensors share does not mix with the dip."""
+    C = _rotation_covariance(np.radians(0.3))
+    assert _heading(C, np.radians(dip_deg)) == pytest.approx(0.3, rel=1e-6)
+    assert _heading(C, np.radians(dip_deg), between=False) >= 0.3
+
+
+def test_heading_without_accelerometer_errors_is_the_horizontal_error_over_the_horizontal_field():
+    C = np.zeros((24, 24))
+    C[21:, 21:] = np.linalg.inv(H_MAG.T @ H_MAG) * 0.2**2  # 0.2 uT about each axis
+    for dip in np.radians([0.0, 66.0]):
+        assert _heading(C, dip) == pytest.approx(np.degrees(0.2 / (FIELD * np.cos(dip))), rel=1e-6)
+        assert _heading(C, dip, between=False) == pytest.approx(_heading(C, dip), rel=1e-9)
+
+
+def test_heading_error_is_the_rms_of_drawn_headings():
+    """Monte Carlo: headings by cross products from wrong models, against those from the true ones."""
+    rng, dip = np.random.default_rng(9), np.radians(63.0)
+    size = np.r_[np.full(9, 2e-6), np.full(3, 1.0), np.full(9, 4e-5), np.full(3, 0.5)]
+    root = rng.normal(size=(24, 24)) * size[:, None]
+    C = root @ root.T + _rotation_covariance(np.radians(0.5))
+    off = []
+    for d in rng.multivariate_normal(np.zeros(24), C, size=4000):
+        R = so3.matrix_from_quat(rng.normal(size=4))  # R_nh
+        f, m = R.T @ [0, 0, G], R.T @ (FIELD * np.array([0, np.cos(dip), -np.sin(dip)]))
+        u_f = (H + d[:9].reshape(3, 3)) @ (np.linalg.inv(H) @ f - d[9:12])
+        u_m = (H_MAG + d[12:21].reshape(3, 3)) @ (np.linalg.inv(H_MAG) @ m - d[21:])
+        east = R @ np.cross(u_m, u_f)
+        off.append(np.degrees(np.arctan2(east[1], east[0])))
+    rms = np.sqrt(np.mean(np.square(off)))
+    assert 0.1 < rms < 5
+    assert _heading(C, dip) == pytest.approx(rms, rel=0.05)
+    assert _heading(C, dip, between=False) > rms

@@ -7,6 +7,7 @@ magnitude of its calibrated reading is off, which needs no attitudes.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +23,9 @@ FULL_TURN_DEG = (345.0, 375.0)
 class Residuals:
     """What is left over at each rest or turn, in `unit` as shown.
 
-    `labels` names each value shortly (``7``, ``7–8``) and `rms` is over all of them. `by` is 'rest', 'turn' or
-    'sample'; `from_fit` is False where the figure is the deviation of the magnitude.
+    `labels` names each value shortly (``7``, ``7–8``). `by` is 'rest', 'turn' or 'sample'; `from_fit` is False where
+    the figure is the deviation of the magnitude. `out` marks what was left out of the fit, whose value may be NaN:
+    `used`, `rms` and `worst` are of the others.
     """
 
     kind: Kind
@@ -32,15 +34,33 @@ class Residuals:
     unit: str
     by: str
     from_fit: bool
+    out: Array
     weight: Array | None = None
 
     @property
+    def used(self) -> Array:
+        return self.value[~self.out]
+
+    @property
     def rms(self) -> float:
-        return float(np.sqrt(np.mean(self.value**2)))
+        return float(np.sqrt(np.mean(self.used**2)))
 
     @property
     def worst(self) -> int:
-        return int(np.argmax(np.abs(self.value)))
+        return int(np.argmax(np.where(self.out, -1.0, np.abs(self.value))))
+
+
+def left_out(calibration: Calibration, code: str) -> set[tuple[int, ...]]:
+    """Numbers of the rests (or pairs of them, turns) that the issues of this code say were left out."""
+    found = set()
+    for issue in calibration.issues:
+        match = _NAMED.search(issue.text) if issue.code == code else None
+        if match is not None:
+            found.add(tuple(int(g) for g in match.groups() if g))
+    return found
+
+
+_NAMED = re.compile(r"\brest (\d{1,6})(?: to (\d{1,6}))?")
 
 
 def setting(calibration: Calibration, name: str) -> float | None:
@@ -84,16 +104,40 @@ def residuals(calibration: Calibration, kind: Kind) -> Residuals | None:
     """The residuals of one sensor, or None where nothing tells them."""
     model, fit = calibration.models[kind], calibration.fits.get(kind)
     factor, unit = shown_unit(model)
-    if fit is not None:
-        value = np.asarray(fit.residual, dtype=np.float64)
-        if value.ndim != 1 or not len(value) or not np.isfinite(value).any():
-            return None
-        labels, by = _turn_labels(calibration, fit) if kind == "gyr" else _rest_labels(calibration, kind, len(value))
-        weight = _weights(fit, len(value))
-        keep = np.isfinite(value)
-        labels = tuple(t for t, k in zip(labels, keep) if k)
-        return Residuals(kind, factor * value[keep], labels, unit, by, True, None if weight is None else weight[keep])
-    return _magnitude_residuals(calibration, model, factor, unit)
+    if fit is None:
+        return _magnitude_residuals(calibration, model, factor, unit)
+    value = np.asarray(fit.residual, dtype=np.float64)
+    if value.ndim != 1 or not len(value) or not np.isfinite(value).any():
+        return None
+    labels, by = _turn_labels(calibration, fit) if kind == "gyr" else _rest_labels(calibration, kind, len(value))
+    out = _turns_left_out(calibration, labels) if kind == "gyr" else np.isnan(value) & _read(calibration, kind, labels)
+    if (out | ~np.isfinite(value)).all():
+        return None
+    weight = _weights(fit, len(value))
+    keep = np.isfinite(value) | out
+    return Residuals(
+        kind,
+        factor * value[keep],
+        tuple(t for t, k in zip(labels, keep) if k),
+        unit,
+        by,
+        True,
+        out[keep],
+        None if weight is None else weight[keep],
+    )
+
+
+def _read(calibration: Calibration, kind: Kind, labels: tuple[str, ...]) -> Array:
+    """Whether the sensor was read at the rest of each label: a NaN there is a reading that was left out."""
+    poses = calibration.poses
+    if poses is None or kind not in poses.mean or len(labels) != len(poses):
+        return np.zeros(len(labels), dtype=bool)
+    return np.isfinite(poses.mean[kind]).all(axis=1)
+
+
+def _turns_left_out(calibration: Calibration, labels: tuple[str, ...]) -> Array:
+    gone = {f"{t[0]}–{t[-1]}" for t in left_out(calibration, "turn-left-out") if len(t) == 2}
+    return np.array([label in gone for label in labels], dtype=bool)
 
 
 def _weights(fit: Fit, n: int) -> Array | None:
@@ -110,7 +154,7 @@ def _magnitude_residuals(calibration: Calibration, model: SensorModel, factor: f
     if not len(index):
         return None
     labels = tuple(str(i + 1) for i in index)
-    return Residuals(model.kind, factor * np.abs(off[index]), labels, unit, "rest", False)
+    return Residuals(model.kind, factor * np.abs(off[index]), labels, unit, "rest", False, np.zeros(len(index), dtype=bool))
 
 
 def _rest_labels(calibration: Calibration, kind: Kind, n: int) -> tuple[tuple[str, ...], str]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from margcal.apps.report_bars import HEIGHT, Bars, bar_row, bar_title, frame, height_of
 from margcal.apps.report_data import Residuals
 from margcal.apps.report_svg import Scale, percent, plot_row, tick_labels
-from margcal.apps.report_text import NAMES, esc, number
+from margcal.apps.report_text import NAMES, esc, listing, number
+from margcal.core.types import Kind
 
-HEIGHT, TOP, FOOT = 140.0, 10.0, 22.0
 MAX_BARS = 240
 OUTSTANDING = 3.0
 """A bar is marked as outstanding beyond this many times the rms of all others."""
@@ -30,8 +31,39 @@ def _unit(found: Residuals) -> str:
 
 def outstanding(found: Residuals) -> bool:
     """Whether the worst one stands out from the others."""
-    others = np.delete(found.value, found.worst)
-    return len(others) > 3 and abs(found.value[found.worst]) > OUTSTANDING * float(np.sqrt(np.mean(others**2)))
+    return len(found.used) > 4 and _times_the_others(found) > OUTSTANDING
+
+
+def _times_the_others(found: Residuals) -> float:
+    """The worst residual in units of the rms of all others."""
+    others = np.delete(found.value, found.worst)[~np.delete(found.out, found.worst)]
+    rms = float(np.sqrt(np.mean(others**2))) if len(others) else 0.0
+    return abs(float(found.value[found.worst])) / rms if rms > 0 else 1.0
+
+
+def worst_pose(all_found: list[Residuals]) -> str:
+    """The rest that fits worst, named, in a sentence or two (HTML); nothing where there are no rests."""
+    at_rest = [f for f in all_found if f.by == "rest"]
+    gone: dict[str, list[Kind]] = {}
+    for found in at_rest:
+        for label, out in zip(found.labels, found.out):
+            if out:
+                gone.setdefault(label, []).append(found.kind)
+    text = ""
+    if gone:
+        told = listing(f"rest {label} (its {listing(NAMES[k] for k in kinds)})" for label, kinds in gone.items())
+        text = f"<p><strong>Left out:</strong> {told}: the readings contradict those of the other rests.</p>"
+    candidates = [f for f in at_rest if len(f.used) > 1]
+    if not candidates:
+        return text
+    found = max(candidates, key=_times_the_others)
+    stands = "stands out from the others" if outstanding(found) else "does not stand out"
+    among = " of those that were used" if gone else ""
+    return text + (
+        f"<p><strong>Worst rest{among}: {found.labels[found.worst]}.</strong> Its {NAMES[found.kind]} is off by "
+        f"{number(abs(found.value[found.worst]), 3)} {esc(found.unit)}, {number(_times_the_others(found), 2)} times the "
+        f"rms of the other rests; it {stands}.</p>"
+    )
 
 
 def _caption(found: Residuals) -> str:
@@ -45,6 +77,9 @@ def _caption(found: Residuals) -> str:
     held = [] if found.weight is None else [t for t, w in zip(found.labels, found.weight) if w < 0.5]
     if held:
         text += f"; held down in the fit because it does not agree with the others: {found.by} {', '.join(held)}"
+    gone = [t for t, out in zip(found.labels, found.out) if out]
+    if gone:
+        text += f"; left out of the fit (crosses): {found.by} {', '.join(gone)}"
     return f"{text}. {_meaning(found)}"
 
 
@@ -61,64 +96,30 @@ def _meaning(found: Residuals) -> str:
     return "What is left of each rest's mean reading after the fit."
 
 
-def _frame(scale: Scale, n: int) -> tuple[list[str], list[str]]:
-    ticks = scale.ticks(n)
-    labels, plot = [], []
-    for v, text in zip(ticks, tick_labels(ticks)):
-        y = _y(scale, v)
-        labels.append(f'<text class="tick" x="52" y="{y + 3.5:.1f}" text-anchor="end">{text}</text>')
-        plot.append(f'<line class="grid" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
-    return labels, plot
-
-
-def _y(scale: Scale, value: float) -> float:
-    return TOP + (1 - float(scale(value))) * (HEIGHT - TOP - FOOT)
-
-
 def _bars(found: Residuals) -> str:
-    size = np.abs(found.value)
-    n = len(size)
-    scale = Scale(0.0, max(float(size.max()), 1e-12) * 1.12)
-    labels, plot = _frame(scale, 3)
-    base = _y(scale, 0.0)
-    last_wide = last_narrow = -1.0
-    for i, v in enumerate(size.tolist()):
-        x, y = (i + 0.5) / n, _y(scale, v)
-        worst = " worst" if i == found.worst else ""
-        held = " held" if found.weight is not None and found.weight[i] < 0.5 else ""
-        share = min(0.72 / n, 0.03)
-        plot.append(
-            f'<rect class="bar{worst}{held}" x="{percent(x - share / 2)}" width="{percent(share)}" y="{y:.1f}" '
-            f'height="{max(base - y, 0.5):.1f}"><title>{found.by} {found.labels[i]}: {number(v, 3)} '
-            f"{esc(found.unit)}</title></rect>"
-        )
-        room = 0.024 if max(map(len, found.labels)) < 4 else 0.048
-        if x - last_wide < room:
-            continue
-        last_wide = x
-        thin = x - last_narrow < 3 * room
-        last_narrow = last_narrow if thin else x
-        plot.append(
-            f'<text class="tick{worst}{" thin" if thin else ""}" x="{percent(x)}" y="{HEIGHT - 6:g}" '
-            f'text-anchor="middle">{found.labels[i]}</text>'
-        )
-    y = _y(scale, found.rms)
-    plot.append(f'<line class="rms" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
+    held = np.zeros(len(found.value), dtype=bool) if found.weight is None else found.weight < 0.5
+    value = np.where(np.isfinite(found.value), np.abs(found.value), 0.0)
+    notes = ["left out of the fit" if out else "" for out in found.out]
+    titles = [
+        bar_title(found.by, label, abs(v), esc(found.unit), note)
+        for label, v, note in zip(found.labels, found.value.tolist(), notes)
+    ]
     title = f"Residual of the {NAMES[found.kind]} by {found.by}, in {_unit(found)}"
-    return plot_row("".join(labels), "".join(plot), HEIGHT, title)
+    return bar_row(Bars(value, found.labels, titles, found.worst, found.rms, held, found.out), title)
 
 
 def _histogram(found: Residuals) -> str:
-    low, high = np.percentile(found.value, [0.1, 99.9])
+    values = found.used
+    low, high = np.percentile(values, [0.1, 99.9])
     if not high > low:
         low, high = low - 0.5, high + 0.5
-    count, edges = np.histogram(np.clip(found.value, low, high), bins=48, range=(low, high))
+    count, edges = np.histogram(np.clip(values, low, high), bins=48, range=(low, high))
     scale = Scale(0.0, float(count.max()) * 1.12)
-    labels, plot = _frame(scale, 3)
+    labels, plot = frame(scale, 3)
     across = Scale(float(low), float(high))
-    base = _y(scale, 0.0)
+    base = height_of(scale, 0.0)
     for c, a, b in zip(count.tolist(), across(edges[:-1]).tolist(), across(edges[1:]).tolist()):
-        y = _y(scale, c)
+        y = height_of(scale, c)
         place = f'x="{percent(a)}" width="{percent((b - a) * 0.94)}"'
         plot.append(f'<rect class="bar" {place} y="{y:.1f}" height="{base - y:.1f}"/>')
     ticks = across.ticks(6)

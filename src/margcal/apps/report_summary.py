@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from margcal.apps.report_data import residuals
-from margcal.apps.report_text import NAMES, esc, fixed, listing, number, plural
+from margcal.apps.report_expected import angle, heading, told
+from margcal.apps.report_findings import finding_list
+from margcal.apps.report_text import NAMES, degrees, esc, listing, number, plural
 from margcal.core.types import Calibration, Kind, SensorModel
 from margcal.core.units import KINDS
 
@@ -80,13 +82,6 @@ def _from_what(calibration: Calibration) -> str:
 def _frame(calibration: Calibration) -> str:
     frame = FRAMES.get(calibration.frame, f"the frame “{esc(calibration.frame, 60)}”")
     return f"in one common frame: {frame}" if len(calibration.models) > 1 else f"in {frame}"
-
-
-def degrees(value: float | None) -> str:
-    """An angle with two significant digits, three where it begins with 1."""
-    if value is None:
-        return "–"
-    return f"{number(value, 3) if value >= 10 else fixed(value, 1 if value >= 3 else 2 if value >= 0.1 else 3)}°"
 
 
 def _card(calibration: Calibration, kind: Kind, model: SensorModel) -> str:

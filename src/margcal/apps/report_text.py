@@ -89,6 +89,13 @@ def plus_minus(value: float | None, se: float | None, digits: int = 5) -> str:
     return f'<span class="num">{fixed(value, decimals)}</span> <span class="se">± {fixed(se, decimals)}</span>'
 
 
+def degrees(value: float | None) -> str:
+    """An angle with two significant digits, three where it begins with 1."""
+    if value is None:
+        return "–"
+    return f"{number(value, 3) if value >= 10 else fixed(value, 1 if value >= 3 else 2 if value >= 0.1 else 3)}°"
+
+
 def plural(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 

@@ -38,11 +38,17 @@ from margcal.methods.affine import checked_readings, checked_rotations, determin
 from margcal.methods.one_step import one_step
 
 MAX_ITER = 30
+MAX_STEP = 0.3
 STEP_TOL = 1e-6
 """Largest last step, in standard deviations of the unknowns."""
 COMPONENT_TOL = 1e-4
 """Largest last change of kappa^2 and s_rot^2, relative; their own standard error is 15 % and more."""
-MIN_S_ROT = 1e-7
+MIN_S_ROT, MAX_S_ROT = 1e-7, 0.2
+"""Range of s_rot, rad; beyond, (1) is no longer first order, and something else is wrong."""
+LEAST_NOISE = 1e-8
+"""Least noise of a reading as a part of the readings' extent; rounding in float64 is near."""
+MIN_NOISE = 1e-3
+"""Least estimate of the noise as a part of what s_rot does to a reading: the housing alone leaves (1) singular."""
 CLEAR = 2.0
 """Twice the gain in log-likelihood from which s_rot counts as different from zero (chance: 8 %). An estimate that
 is not clear of zero is noise: taken at its word it would widen every covariance."""
@@ -163,7 +169,10 @@ def gls_ml(
     start = _start(y, R, counted, kind, single=not lead)
     centre, size = _scale(y, counted)
     problem = _Problem(
-        (y - centre[:, None]) / size[:, None, None], R, noise / size[:, None, None], np.where(counted, 1.0, 0.0)
+        (y - centre[:, None]) / size[:, None, None],
+        R,
+        np.maximum(noise / size[:, None, None], LEAST_NOISE),
+        np.where(counted, 1.0, 0.0),
     )
     state = _first_state(problem, start, centre, size, noise_sd is None, s_rot)
     state, n_iter = _solve(problem, state, (noise_sd is None, False), max_iter)
@@ -229,7 +238,7 @@ def _with_s_rot(p: _Problem, null: _State, free_noise: bool, max_iter: int) -> t
     worth = np.flatnonzero((score[:, 1] > 0) & null.converged)  # elsewhere the likelihood falls from zero on
     if not len(worth):
         return null, 0
-    first = np.maximum(score[worth, 1] / info[worth, 1, 1], MIN_S_ROT**2)
+    first = np.clip(score[worth, 1] / info[worth, 1, 1], MIN_S_ROT**2, MAX_S_ROT**2)
     full, n_iter = _solve(p.of(worth), replace(null.of(worth), rot2=first), (free_noise, True), max_iter)
     gain = 2 * (_linearise(p.of(worth), full).log_likelihood - at.log_likelihood[worth])
     better = full.converged & (gain > CLEAR)
@@ -267,6 +276,8 @@ def _linearise(p: _Problem, state: _State) -> _Linear:
 
 
 def _moved(state: _State, step: Array) -> _State:
+    # in these units A and u are of order one: longer steps come of a wrong label or a wild s_rot, and run away
+    step = step * np.minimum(1.0, MAX_STEP / np.maximum(np.linalg.norm(step, axis=-1), 1e-300))[:, None]
     u = state.u + (tangents(state.u) @ step[:, 12:, None])[..., 0]
     u = u / np.linalg.norm(u, axis=-1, keepdims=True)
     return replace(state, A=state.A + step[:, :9].reshape(-1, 3, 3), b=state.b + step[:, 9:12], u=u)
@@ -306,7 +317,9 @@ def _reml(p: _Problem, at: _Linear, state: _State, free: tuple[bool, bool]) -> t
     step = np.linalg.solve(scaled, (score / d)[..., None])[..., 0] / d
     theta = np.stack([state.kappa2, state.rot2], axis=-1)
     new = np.where(free, np.clip(theta + step, 0.2 * theta, 5 * theta + 1e-12), theta)
-    return new[:, 0], np.maximum(new[:, 1], MIN_S_ROT**2)
+    rot2 = np.clip(new[:, 1], MIN_S_ROT**2, MAX_S_ROT**2) if free[1] else new[:, 1]
+    least = MIN_NOISE**2 * rot2 / np.mean(p.noise**2, axis=(-1, -2))
+    return np.maximum(new[:, 0], least) if free[0] else new[:, 0], rot2
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,8 @@ def _fit(batch: TurnBatch, q: Array, history: Array, B: ArrayLike | None, method
     step = np.linalg.norm(history[-1] - history[-2], axis=(-2, -1)) / np.linalg.norm(H, axis=(-2, -1))
     settled = bool(np.all(step < 1e-3))
     bias = np.broadcast_to(np.zeros(3) if B is None else np.asarray(B, dtype=np.float64), H.shape[:-1])
-    model = SensorModel("gyr", H, bias, raw_unit, n_poses=q.shape[-2], method=method)
+    rms = float(np.sqrt(np.mean(residual**2))) if H.ndim == 2 else None
+    model = SensorModel("gyr", H, bias, raw_unit, residual_rms=rms, n_poses=q.shape[-2], method=method)
     text = "" if settled else f"H still moves after {len(history) - 1} iterations; start nearer or iterate longer"
     return Fit(
         model,

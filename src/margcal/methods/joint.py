@@ -123,7 +123,11 @@ class _State:
 
 @dataclass(frozen=True)
 class JointFit:
-    """The estimate; `covariance[kind]` (12, 12) is that of (H row by row, then B)."""
+    """The estimate; `covariance[kind]` (12, 12) is that of (H row by row, then B).
+
+    `mag_acc` (12, 12) or None: the magnetometer's (H, B) against the accelerometer's. They share the attitudes, hence
+    their errors, which is what a heading's error depends on.
+    """
 
     H: dict[Kind, Array]
     B: dict[Kind, Array]
@@ -142,6 +146,7 @@ class JointFit:
     dof: float
     n_iter: int
     converged: bool
+    mag_acc: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -549,6 +554,7 @@ def _result(
         dof=float(sum(redundancy.values())),
         n_iter=n_iter,
         converged=converged,
+        mag_acc=_between(layout, inverse, "mag", "acc", H) if {"acc", "mag"} <= triads.keys() else None,
     )
 
 
@@ -571,6 +577,12 @@ def _model_covariance(layout: _Layout, inverse: Array, kind: Kind, H: Array) -> 
     columns, to = _columns(layout, kind), _to_model(layout, kind, H)
     C = to @ inverse[np.ix_(columns, columns)] @ to.T
     return (C + C.T) / 2
+
+
+def _between(layout: _Layout, inverse: Array, one: Kind, other: Kind, H: Mapping[Kind, Array]) -> Array:
+    """Covariance (12, 12) of one sensor's (H, B) with another's."""
+    C = inverse[np.ix_(_columns(layout, one), _columns(layout, other))]
+    return _to_model(layout, one, H[one]) @ C @ _to_model(layout, other, H[other]).T
 
 
 def _shifts(

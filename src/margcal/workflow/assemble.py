@@ -76,15 +76,41 @@ def _signed(job: Job, kind: Kind, solved: Solved, issues: list[Issue]) -> Fit:
     if kind in solved.vectors:
         solved.vectors[kind] = -solved.vectors[kind]
     model = replace(fit.model, H=-H, covariance=_negated(fit.model.covariance))
-    return replace(fit, model=model, u=None if fit.u is None else -fit.u, covariance=model.covariance)
+    _negate_between(kind, solved)
+    fit = solved.fits[kind]
+    return replace(
+        fit,
+        model=model,
+        u=None if fit.u is None else -fit.u,
+        covariance=model.covariance,
+        details=_negated_rows(fit.details),
+    )
+
+
+_SIGNS = np.r_[-np.ones(9), np.ones(3)]
+"""What becomes of (H row by row, B) when H changes its sign."""
+
+
+def _negated_rows(details: Mapping[str, Array]) -> dict[str, Array]:
+    """Details of (-H, B): leave-one-out shifts have a parameter to the column."""
+    return {k: v * _SIGNS if k == "leave_one_out" else v for k, v in details.items()}
+
+
+def _negate_between(kind: Kind, solved: Solved) -> None:
+    """The magnetometer's covariance with the accelerometer, when one of the two changes its sign."""
+    mag = solved.fits.get("mag")
+    if mag is None or kind == "gyr" or "covariance_with_acc" not in mag.details:
+        return
+    signs = _SIGNS[:, None] if kind == "mag" else _SIGNS
+    details = {**mag.details, "covariance_with_acc": mag.details["covariance_with_acc"] * signs}
+    solved.fits["mag"] = replace(mag, details=details)
 
 
 def _negated(C: Array | None) -> Array | None:
     """Covariance of (-H, B)."""
     if C is None:
         return None
-    s = np.r_[-np.ones(9), np.ones(3)]
-    return C * np.outer(s, s)
+    return C * np.outer(_SIGNS, _SIGNS)
 
 
 def _field_up(job: Job, solved: Solved) -> float | None:

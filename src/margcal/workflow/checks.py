@@ -16,6 +16,7 @@ from margcal.core.types import Calibration, Fit, Issue, Kind, Level, SensorModel
 from margcal.core.units import UNITS
 from margcal.methods.uncertainty import expected_error, sphere, weakest_direction
 from margcal.workflow.job import NAMES, Job, Solved
+from margcal.workflow.robust import MIN_POSES
 
 EXPECTED_ERROR_DEG = (0.5, 2.0)
 RESIDUAL = (0.02, 0.10)
@@ -75,7 +76,7 @@ def verdict_of(calibration: Calibration, asked: Sequence[Kind] | None) -> Verdic
 
 def _sensor_checks(job: Job, solved: Solved, model: SensorModel) -> list[Check]:
     checks = [_expected_error(job, model), _residual(job, model), _condition(model)]
-    checks += [_gain(model), _methods_agree(job, solved, model)]
+    checks += [_gain(model), _methods_agree(job, solved, model), _remaining(job, solved, model.kind)]
     if model.kind == "mag":
         checks += [_field_strength(job, model), _dip(job, solved)]
     return [c for c in checks if c is not None]
@@ -200,6 +201,20 @@ def _dip(job: Job, solved: Solved) -> Check | None:
     if value > DIP_OFF_DEG:
         text += "; the field here is disturbed (steel, furniture): its size is not the model's either. Record elsewhere"
     return Check("dip", "mag", value, DIP_OFF_DEG, "pass" if value <= DIP_OFF_DEG else "warn", text)
+
+
+def _remaining(job: Job, solved: Solved, kind: Kind) -> Check | None:
+    """Rests that are left for a sensor after those that contradict the others."""
+    out = solved.left_out.get("rot", set()) | solved.left_out.get(kind, set())
+    if not out:
+        return None
+    rests = len(job.segmentation.poses)
+    remain = rests - len(out)
+    text = f"{NAMES[kind]}: {len(out)} of {rests} rests contradict the others and were left out; {remain} remain"
+    if remain < MIN_POSES:
+        text += f", {MIN_POSES} are needed to tell who is right: record again, with more rests"
+    level = "pass" if remain >= MIN_POSES else "fail"
+    return Check("rests-remaining", kind, float(remain), float(MIN_POSES), level, text)
 
 
 def _housing(value: float) -> Check:

@@ -79,7 +79,7 @@ class Solved:
     R: Array | None = None
     joint: JointFit | None = None
     singles: dict[Kind, Fit] = field(default_factory=dict)
-    left_out: int = 0
+    left_out: dict[str, set[int]] = field(default_factory=dict)  # see robust.LeftOut
 
     def attempt(self, kind: Kind, solve: Callable[[], Fit]) -> Fit | None:
         """Keep the fit of one sensor, or the reason why there is none."""

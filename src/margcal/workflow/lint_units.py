@@ -84,7 +84,7 @@ def _finite(stream: Stream) -> Stream:
 
 def _mismatch(kind: Kind, text: str, proposal: str | None, value: float, limit: float) -> Issue:
     if proposal is not None:
-        text += f"; if so, give --units {kind}={proposal}, or name the columns {kind}_x_{proposal} ..."
+        text += f"; if so, give --units {kind}={proposal}, or name its columns {kind}_x_{proposal} and so on"
     return Issue(f"{kind}-unit", "fail", text, None, value, limit)
 
 

@@ -387,7 +387,8 @@ def _jointly(
     robust = robust_joint(triads, gyro, solved.R, priors)
     if robust.fit.converged and all(np.isfinite(h).all() for h in robust.fit.H.values()):
         solved.singles = dict(solved.fits)
-        solved.left_out = len(robust.left_out)
+        for out in robust.left_out:
+            solved.left_out.setdefault(out.what, set()).add(out.index)
         adopt(solved, robust.fit)
         solved.issues += issues_of(robust, cube=job.attitudes.mode in ("cube", "file"))
         return
@@ -453,9 +454,16 @@ def adopt(solved: Solved, joint: JointFit) -> None:
             covariance=C,
             u=joint.u.get(kind),
             n_iter=joint.n_iter,
-            details={"leave_one_out": joint.shift[kind]},
+            details=_details(joint, kind),
             method="gls-ml",
             cites="not in the papers: joint maximum likelihood, see margcal.methods.joint",
         )
         if kind in joint.u:
             solved.vectors[kind] = joint.u[kind]
+
+
+def _details(joint: JointFit, kind: Kind) -> dict[str, Array]:
+    details = {"leave_one_out": joint.shift[kind]}
+    if kind == "mag" and joint.mag_acc is not None:
+        details["covariance_with_acc"] = joint.mag_acc
+    return details

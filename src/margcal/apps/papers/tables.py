@@ -150,9 +150,7 @@ def as_plain(result: Reproduction) -> dict[str, Any]:
             "name": table.name,
             "title": table.title,
             "settings": list(table.settings),
-            "cells": [
-                {**asdict(c), "ratio": c.ratio, "reproduced": c.reproduced, "mark": c.mark} for c in table.cells
-            ],
+            "cells": [{**asdict(c), "ratio": c.ratio, "reproduced": c.reproduced, "mark": c.mark} for c in table.cells],
         }
 
     return _finite(
