@@ -177,6 +177,32 @@ def clipped(kind: str, share: float = 0.8) -> Damage:
     return damage
 
 
+def copied(source: str, to: str) -> Damage:
+    def damage(table: Columns) -> None:
+        table[f"{to}_count"] = table[f"{source}_count"].copy()
+
+    return damage
+
+
+def nearly_copied(source: str, to: str) -> Damage:
+    """The axis `to` senses what `source` senses, with a noise of its own."""
+
+    def damage(table: Columns) -> None:
+        own = np.random.default_rng(0).integers(-2, 3, len(table["t_s"]))
+        table[f"{to}_count"] = table[f"{source}_count"] + own
+
+    return damage
+
+
+def noise(kind: str) -> Damage:
+    def damage(table: Columns) -> None:
+        rng = np.random.default_rng(0)
+        for name in axes(kind):
+            table[name] = np.round(rng.normal(100, 3, len(table["t_s"])))
+
+    return damage
+
+
 def cell(name: str, row: int, value: float) -> Damage:
     def damage(table: Columns) -> None:
         table[name] = np.array(table[name], dtype=np.float64)
@@ -407,6 +433,36 @@ CASES = [
         lambda table: {k: 40 * np.round(v / 40) if k.startswith("mag") else v for k, v in table.items()},
         has=(("warn", "coarse-quantisation", "mag"),),
         bug="steps coarser than the noise do not enter the covariance: 2.3 degrees wrong, 0.18 claimed",
+    ),
+    Case("acc-twice-in-acc", "10", 3, copied("acc_x", "acc_y"), has=(("fail", "same-axes", "acc"),), says=("x and y",)),
+    Case("mag-twice-in-mag", "10", 0, copied("mag_x", "mag_y"), has=(("fail", "same-axes", "mag"),), without=("mag",)),
+    Case("gyr-nearly-twice", "10", 0, nearly_copied("gyr_x", "gyr_y"), without=("gyr",)),
+    Case("mag-nearly-twice", "10", 0, nearly_copied("mag_x", "mag_y"), without=("mag",)),
+    Case(
+        "acc-called-mag",
+        "10",
+        0,
+        lambda table: {k: table[k.replace("mag", "acc")] for k in table},
+        has=(("fail", "same-readings", "mag"),),
+        without=("mag",),
+    ),
+    Case("gyr-is-noise", "10", 0, noise("gyr"), without=("gyr",)),
+    Case("mag-is-noise", "10", 0, noise("mag"), without=("mag",)),
+    Case("acc-is-noise", "10", 3, noise("acc"), without=ALL),
+    Case(
+        "absurd-numbers",
+        "2",
+        3,
+        lambda table: {k: v if k == "t_s" else 1e300 * v for k, v in table.items()},
+        has=(("fail", "too-large", "acc"), ("fail", "too-large", "gyr"), ("fail", "too-large", "mag")),
+        without=ALL,
+    ),
+    Case(
+        "tiny-counts",
+        "-",
+        0,
+        lambda table: {k: v if k == "t_s" else 1e-9 * v for k, v in table.items()},
+        scale=dict.fromkeys(ALL, 1e-9),
     ),
     # rows 12 to 17: time
     Case(
@@ -911,6 +967,14 @@ def test_two_recordings_in_different_units(tmp_path: Path) -> None:
     outcome = margcal(tmp_path, "calibrate", "a.parquet", "b.parquet")
     assert outcome.status == 1
     assert "count in a.parquet" in outcome.err and "g in b.parquet" in outcome.err
+
+
+@pytest.mark.xfail(strict=True, reason=NAN)
+def test_two_nodes_as_one(tmp_path: Path) -> None:
+    for seed in (3, 9):
+        write_table(tmp_path / f"{seed}.parquet", columns(session(n_poses=24, seed=seed).recording))
+    outcome = margcal(tmp_path, "calibrate", "3.parquet", "9.parquet", "-o", "cal.json", "--json")
+    assert outcome.status == 3 and not outcome.new
 
 
 def test_no_such_file(tmp_path: Path) -> None:

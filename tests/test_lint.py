@@ -136,6 +136,22 @@ def test_a_sensor_that_was_never_read() -> None:
     assert (issue.level, issue.sensor) == ("fail", "acc")
 
 
+def test_a_channel_that_was_written_twice() -> None:
+    issue = found(damaged(session(), "mag", lambda y: y[:, [0, 1, 0]]), "same-axes")
+    assert (issue.level, issue.sensor) == ("fail", "mag") and "x and z" in issue.text
+
+
+def test_a_sensor_that_was_written_twice() -> None:
+    acc = session().streams["acc"]
+    issue = found(replace(session(), mag=replace(acc, kind="mag")), "same-readings")
+    assert (issue.level, issue.sensor) == ("fail", "mag")
+
+
+def test_readings_of_no_converter() -> None:
+    issue = found(damaged(session(), "gyr", lambda y: 1e300 * y), "too-large")
+    assert (issue.level, issue.sensor) == ("fail", "gyr")
+
+
 @pytest.mark.parametrize(("seconds", "level"), [(1.0, "warn"), (20.0, "fail")])
 def test_an_axis_that_sticks_for_a_while(seconds: float, level: str) -> None:
     def stick(y: Array) -> None:

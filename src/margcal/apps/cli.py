@@ -216,6 +216,18 @@ def report(calibration: str, recordings: tuple[str, ...], **given: Any) -> int:
 
 
 @cli.command()
+@click.argument("calibrations", nargs=-1, required=True, metavar="CAL.json CAL.json...")
+@_output("DIR", False, "Tables (JSON, CSV) and pictures (SVG) into this folder.")
+@_overwrite
+@_json
+def compare(calibrations: tuple[str, ...], **given: Any) -> int:
+    """Hold several calibrations of one node against each other: how well do B, H and converted readings agree?"""
+    from margcal.apps.comparing import run
+
+    return run(calibrations, **given)
+
+
+@cli.command()
 @_output("DIR", True, "Where session.parquet, poses.csv and truth.json go.")
 @click.option("--n-poses", type=int, metavar="N", help="Rests.  [default: 24]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
@@ -251,6 +263,20 @@ def simulate(duration_s: float | None, **given: Any) -> int:
     elif duration_s is not None:
         raise click.UsageError("--duration-s is for --poses swing")
     return run(rests=rests, node=node, **given)
+
+
+@cli.command()
+@click.argument("paper", type=click.Choice(["z-tie", "zy-tbme"]))
+@click.option("--runs", type=click.IntRange(min=2), default=1000, show_default=True, help="Of each simulation.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@_output("DIR", False, "Tables (JSON, CSV) and figures (SVG) into this folder.")
+@_overwrite
+@_json
+def reproduce(paper: str, **given: Any) -> int:
+    """Print a paper's tables beside ours: z-tie and zy-tbme are the two that the solvers come from."""
+    from margcal.apps.papers.reproduce import run
+
+    return run(paper, **given)
 
 
 # --- running ------------------------------------------------------------------------------------------

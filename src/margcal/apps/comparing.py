@@ -82,8 +82,8 @@ def compare(calibrations: Sequence[Calibration], names: Sequence[str]) -> dict[K
     for calibration, name in zip(calibrations[1:], names[1:]):
         if calibration.frame != calibrations[0].frame:
             raise InputError(
-                f"{names[0]} is in frame {calibrations[0].frame} and {name} in frame {calibration.frame}; their numbers "
-                "compare only after the rotation between the frames: calibrate both with the same --poses"
+                f"{names[0]} is in frame {calibrations[0].frame} and {name} in frame {calibration.frame}; their "
+                "numbers compare only after the rotation between the frames: calibrate both with the same --poses"
             )
     found: dict[Kind, tuple[Repeatability, list[str]]] = {}
     for kind in KINDS:
@@ -288,7 +288,7 @@ def reading_picture(r: Repeatability, names: Sequence[str]) -> str:
         "standard deviation over the calibrations",
         "reading",
         f"sd, {unit}",
-        tuple(Curve(axis, index, sd[:, k], COLOURS[k], dots=True) for k, axis in enumerate("xyz")),
+        tuple(Curve(axis, index, sd[:, k], COLOURS[k], dots=True, line=False) for k, axis in enumerate("xyz")),
         y_range=(0.0, 1.15 * float(sd.max()) or 1.0),
     )
     return figure(f"{NAMES[r.kind]}: {len(r.raw)} raw readings, {r.n} calibrations", [left, right], width=520)

@@ -11,20 +11,23 @@ import base64
 import hashlib
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 from margcal.apps.report_attitudes import gallery
-from margcal.apps.report_data import attitudes, residuals
+from margcal.apps.report_checks import checks_of, checks_table
+from margcal.apps.report_data import attitudes, left_out, residuals
+from margcal.apps.report_expected import expected
 from margcal.apps.report_findings import findings, provenance
+from margcal.apps.report_influence import influence, influences
 from margcal.apps.report_parameters import matrices, parameter_table
-from margcal.apps.report_residuals import residual_figure
+from margcal.apps.report_residuals import residual_figure, worst_pose
 from margcal.apps.report_sphere import sphere_data, still_pictures
 from margcal.apps.report_summary import masthead
 from margcal.apps.report_text import NAMES, data_block, esc, plural
 from margcal.apps.report_timeline import timelines
 from margcal.apps.report_usage import usage
-from margcal.core.types import Calibration, Recording
+from margcal.core.types import Calibration
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,8 @@ def render(calibration: Calibration) -> str:
     Parameters
     ----------
     calibration : Calibration
-        As `calibrate` returns it; of a loaded one there are the parameters, their uncertainty and how to apply
-        them, and with `with_recordings` the readings as well.
+        As `calibrate` returns it; of a loaded one there are the checks, the parameters, their uncertainty and how to
+        apply them, and with `revisit` the readings as well.
 
     Returns
     -------
@@ -75,27 +78,27 @@ def write_report(calibration: Calibration, path: str | os.PathLike[str], *, over
         temporary.write_text(page, encoding="utf-8", newline="\n")
 
 
-def with_recordings(calibration: Calibration, *recordings: Recording) -> Calibration:
-    """A loaded calibration with recordings to show beside it: their rests are looked for here.
-
-    A sensor whose unit is not the raw unit that the calibration was made for is left out.
-    """
-    from margcal.workflow.segment import find_poses
-
-    models = calibration.models
-    fitting = tuple(
-        replace(r, **{k: None for k, s in r.streams.items() if k in models and s.unit != models[k].raw_unit})
-        for r in recordings
-    )
-    found = find_poses(*fitting)
-    return replace(calibration, recordings=fitting, poses=found.poses, turns=found.turns)
-
-
 # --- sections ----------------------------------------------------------------------------------------
 
 
 def _findings(calibration: Calibration) -> Section | None:
-    return Section("findings", "Findings", "What the program noticed on the way.", findings(calibration))
+    lead = "What else the program noticed on the way; failures and warnings stand under the verdict."
+    return Section("findings", "Notes", lead, findings(calibration))
+
+
+def _expected(calibration: Calibration) -> Section | None:
+    body = expected(calibration)
+    lead = (
+        "How far a calibrated reading is likely to be off, from the covariance of the twelve numbers: root mean square "
+        "over all directions, one standard deviation."
+    )
+    return Section("expected", "Expected error", lead, body) if body else None
+
+
+def _checks(calibration: Calibration) -> Section | None:
+    rows = checks_of(calibration)
+    lead = "What the verdict was made from. Each figure stands before its limit."
+    return Section("checks", "Checks", lead, checks_table(rows)) if rows else None
 
 
 def _recorded(calibration: Calibration) -> Section | None:
@@ -107,14 +110,16 @@ def _recorded(calibration: Calibration) -> Section | None:
 
 
 ATTITUDES = {
-    "cube": "<strong>Cube.</strong> Each rest is one of the housing's 24 attitudes; the readings tell which.",
-    "faces": "<strong>Faces.</strong> One face of the housing is up at each rest, in any heading.",
-    "file": "<strong>Told.</strong> The attitudes were read from a file.",
-    "reference": "<strong>Reference.</strong> The attitudes were measured from outside, beside the readings.",
-    "free": "<strong>Free.</strong> Nothing was told of the attitudes; these are estimated, in the sensors' own frame.",
-    "swing": "<strong>Continuous motion.</strong>",
+    "cube": ("<strong>Cube.</strong> Each rest is one of the housing's 24 attitudes; the readings tell which.", True),
+    "faces": ("<strong>Faces.</strong> One face of the housing is up at each rest.", True),
+    "file": ("<strong>Told.</strong> The attitudes were read from a table.", False),
+    "reference": ("<strong>Reference.</strong> The attitudes were measured from outside, beside the readings.", True),
+    "free": (
+        "<strong>Free.</strong> Nothing was told of the attitudes; these are estimated, in the sensors' own frame.",
+        False,
+    ),
 }
-"""By what was taken (`settings['attitudes']`)."""
+"""By what was taken (`settings['attitudes']`): a sentence, and whether the program's own words say more than it."""
 
 
 def _attitudes(calibration: Calibration) -> Section | None:
@@ -122,12 +127,19 @@ def _attitudes(calibration: Calibration) -> Section | None:
     if R is None:
         return None
     text, mode = calibration.settings.get("attitudes_text"), calibration.settings.get("attitudes")
-    said = ATTITUDES.get(mode, "") if isinstance(mode, str) else ""
-    said = f"<p>{said} {esc(text) + '.' if isinstance(text, str) and text else ''}</p>"
+    said, more = ATTITUDES.get(mode, ("", True)) if isinstance(mode, str) else ("", True)
+    if more and isinstance(text, str) and text:
+        said += f" {esc(text[:1].upper() + text[1:])}."
+    said = f"<p>{said.strip()}</p>" if said else ""
+    gone = {t[0] for t in left_out(calibration, "label-left-out")}
+    if gone:
+        said += (
+            '<p class="note">Framed: what was told or taken does not hold there; the attitude drawn is estimated.</p>'
+        )
     if not headings:
         said += '<p class="note">Headings are not known: each box is drawn in the heading that turns it least.</p>'
     lead = f"{plural(len(R), 'rest')}, each seen from the same place. The arrow is up."
-    return Section("attitudes", "Attitudes taken", lead, said + gallery(R))
+    return Section("attitudes", "Attitudes taken", lead, said + gallery(R, gone))
 
 
 def _sphere(calibration: Calibration) -> Section | None:
@@ -147,7 +159,13 @@ def _residuals(calibration: Calibration) -> Section | None:
     if not found:
         return None
     lead = "What the calibration does not explain, rest by rest and turn by turn."
-    return Section("residuals", "Residuals", lead, "".join(map(residual_figure, found)))
+    return Section("residuals", "Residuals", lead, worst_pose(found) + "".join(map(residual_figure, found)))
+
+
+def _influence(calibration: Calibration) -> Section | None:
+    found = influences(calibration)
+    lead = "How far the answer moves when a rest is left out. Bars below the dashed line matter less than chance."
+    return Section("influence", "Leaving out a rest", lead, influence(found)) if found else None
 
 
 def _parameters(calibration: Calibration) -> Section | None:
@@ -176,15 +194,18 @@ def _provenance(calibration: Calibration) -> Section | None:
 
 SECTIONS: Sequence[Callable[[Calibration], Section | None]] = (
     _findings,
+    _expected,
+    _checks,
     _recorded,
     _attitudes,
     _sphere,
     _residuals,
+    _influence,
     _parameters,
     _usage,
     _provenance,
 )
-"""In the order of the page. The summary (verdict, expected errors) stands before all of them in the masthead."""
+"""In the order of the page. Verdict, its reasons and the expected errors stand before all of them in the masthead."""
 
 
 def _section(section: Section) -> str:

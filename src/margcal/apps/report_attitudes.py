@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 
@@ -35,9 +36,9 @@ def view(azimuth: float = _AZIMUTH, elevation: float = _ELEVATION) -> Array:
     return np.array([[-sa, ca, 0.0], [-se * ca, -se * sa, ce], [ce * ca, ce * sa, se]])
 
 
-def gallery(R: Array) -> str:
-    """Boxes of the rests (J, 3, 3), numbered from 1."""
-    cells = [_cell(i + 1, r) for i, r in enumerate(R[:MAX_DRAWN])]
+def gallery(R: Array, framed: Collection[int] = ()) -> str:
+    """Boxes of the rests (J, 3, 3), numbered from 1; those whose numbers are in `framed` are marked."""
+    cells = [_cell(i + 1, r, i + 1 in framed) for i, r in enumerate(R[:MAX_DRAWN])]
     more = len(R) - MAX_DRAWN
     note = f'<p class="note">{plural(more, "further rest")} not drawn.</p>' if more > 0 else ""
     return f'<ol class="boxes">{"".join(cells)}</ol>{note}'
@@ -53,12 +54,12 @@ def up_name(R: Array) -> str:
     return f"{name} {math.degrees(math.acos(min(1.0, abs(float(up[k]))))):.0f}° from up"
 
 
-def _cell(n: int, R: Array) -> str:
+def _cell(n: int, R: Array, framed: bool) -> str:
     if not np.isfinite(R).all():
         return f'<li><svg viewBox="0 0 100 100" aria-hidden="true"></svg><span><b>{n}</b> not known</span></li>'
-    name = up_name(R)
+    name, frame = up_name(R), ' class="framed"' if framed else ""
     return (
-        f'<li><svg viewBox="0 0 {SIZE:g} {SIZE:g}" role="img" aria-label="rest {n}: {name}">{_box(R)}</svg>'
+        f'<li{frame}><svg viewBox="0 0 {SIZE:g} {SIZE:g}" role="img" aria-label="rest {n}: {name}">{_box(R)}</svg>'
         f"<span><b>{n}</b> {name}</span></li>"
     )
 

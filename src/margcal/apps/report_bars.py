@@ -103,9 +103,7 @@ def _numbers(bars: Bars) -> list[str]:
         thin = x - last_narrow < 3 * room
         last_narrow = last_narrow if thin else x
         name = f"tick{' worst' if i == bars.worst or bars.out[i] else ''}{' thin' if thin else ''}"
-        out.append(
-            f'<text class="{name}" x="{percent(x)}" y="{HEIGHT - 6:g}" text-anchor="middle">{text}</text>'
-        )
+        out.append(f'<text class="{name}" x="{percent(x)}" y="{HEIGHT - 6:g}" text-anchor="middle">{text}</text>')
     return out
 
 

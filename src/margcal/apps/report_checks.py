@@ -25,6 +25,8 @@ WORDS = {
     "housing-error": ("Housing", "How far it lay from the attitudes taken, rms about each axis.", "°"),
 }
 """Name, meaning and unit by code."""
+AT_LEAST = {"rests-remaining"}
+"""Codes whose limit is the least that passes."""
 LEVELS = {"pass": "passed", "warn": "warning", "fail": "failed"}
 
 
@@ -90,7 +92,7 @@ def _cell(row: Row, unit: str) -> str:
     limit = ""
     if math.isfinite(row.limit):
         above = row.value > row.limit
-        least = above == (row.level == "pass") and math.isfinite(row.value)
+        least = row.code in AT_LEAST or (math.isfinite(row.value) and above == (row.level == "pass"))
         limit = f'<span class="limit">{"≥" if least else "≤"} {_figure(row.limit, unit)}</span>'
     return (
         f'<span class="mark {row.level}" title="{esc(row.text, 600)}"><span class="level">{LEVELS[row.level]}</span>'

@@ -154,7 +154,9 @@ def _magnitude_residuals(calibration: Calibration, model: SensorModel, factor: f
     if not len(index):
         return None
     labels = tuple(str(i + 1) for i in index)
-    return Residuals(model.kind, factor * np.abs(off[index]), labels, unit, "rest", False, np.zeros(len(index), dtype=bool))
+    return Residuals(
+        model.kind, factor * np.abs(off[index]), labels, unit, "rest", False, np.zeros(len(index), dtype=bool)
+    )
 
 
 def _rest_labels(calibration: Calibration, kind: Kind, n: int) -> tuple[tuple[str, ...], str]:

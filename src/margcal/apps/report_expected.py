@@ -98,8 +98,10 @@ def expected(calibration: Calibration) -> str:
         for kind, e in errors.items()
     ]
     head = ["Sensor", "Direction, rms", "Worst direction", "Magnitude, rms"]
-    return table(head, rows, "expected errors of the sensors", "expected") + _node(calibration, errors) + _ellipses(
-        calibration, errors
+    return (
+        table(head, rows, "expected errors of the sensors", "expected")
+        + _node(calibration, errors)
+        + _ellipses(calibration, errors)
     )
 
 
@@ -160,7 +162,7 @@ def _ellipses(calibration: Calibration, errors: dict[Kind, ExpectedError]) -> st
     times = f"{number(factor, 6)} times" if factor != 1 else "in true size"
     size = "enlarged " if factor > 1 else "drawn at " if factor < 1 else ""
     return (
-        f'<figure class="balls"><figcaption>Where a calibrated reading lies that should be at the middle of an ellipse: '
+        f'<figure class="balls"><figcaption>Where a calibrated reading may lie that belongs at the middle of an ellipse: '
         f"one standard deviation, {size}{times}, in 26 directions of the calibrated frame. Marked: the largest of each "
         f'sensor. Pale: on the far side.</figcaption><div class="stills">{pictures}</div></figure>'
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from margcal.apps.report_text import NAMES, esc, number, plural, table
@@ -23,7 +23,7 @@ _SETTINGS = {
     "units": "Units",
     "sources": "Taken from",
 }
-_HIDDEN = {"attitudes_figures"}
+_HIDDEN = {"attitudes_figures", "checks"}
 MAX_ISSUES = 300
 _ALONE = (
     "This report was made from the calibration alone. Readings, attitudes and residuals are shown when it is given "
@@ -32,15 +32,21 @@ _ALONE = (
 
 
 def findings(calibration: Calibration) -> str:
-    """The issues, the gravest first."""
-    order = list(LEVELS)
-    issues = sorted(calibration.issues, key=lambda i: order.index(i.level) if i.level in LEVELS else 9)
+    """The notes; failures and warnings stand under the verdict."""
+    notes = [i for i in calibration.issues if i.level not in ("fail", "warn")]
     alone = "" if calibration.recordings else f'<p class="quiet">{_ALONE}</p>'
-    if not issues:
+    if not notes:
         return alone or '<p class="quiet">Nothing to report.</p>'
+    return finding_list(notes) + alone
+
+
+def finding_list(issues: Sequence[Issue]) -> str:
+    """Issues as a list, the gravest first."""
+    order = list(LEVELS)
+    issues = sorted(issues, key=lambda i: order.index(i.level) if i.level in LEVELS else 9)
     more = len(issues) - MAX_ISSUES
     rest = f'<li class="note">{plural(more, "further finding")} not listed.</li>' if more > 0 else ""
-    return f'<ul class="findings">{"".join(map(_finding, issues[:MAX_ISSUES]))}{rest}</ul>{alone}'
+    return f'<ul class="findings">{"".join(map(_finding, issues[:MAX_ISSUES]))}{rest}</ul>'
 
 
 def _finding(issue: Issue) -> str:

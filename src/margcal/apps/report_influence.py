@@ -47,7 +47,9 @@ def influences(calibration: Calibration) -> list[Influence]:
         if not len(index):
             continue
         value = shift_deg(kind, model.H, shift[index], magnitude(calibration, model))
-        found.append(Influence(kind, value, index, model.expected_error_deg, frozenset(labels | _gone(calibration, kind))))
+        found.append(
+            Influence(kind, value, index, model.expected_error_deg, frozenset(labels | _gone(calibration, kind)))
+        )
     return sorted(found, key=lambda f: list(calibration.models).index(f.kind))
 
 
@@ -75,8 +77,8 @@ def _most(found: list[Influence]) -> str:
     most = max(known, key=_times)
     moved, times = degrees(float(most.value.max())), _times(most)
     text = (
-        f"<strong>Most influential: rest {most.largest}.</strong> Without it, directions of the {NAMES[most.kind]} turn "
-        f"by {moved} rms, {number(times, 2)} times the expected error"
+        f"<strong>Most influential: rest {most.largest}.</strong> Without it, directions of the {NAMES[most.kind]} "
+        f"turn by {moved} rms, {number(times, 2)} times the expected error"
     )
     text += (
         ": the answer does not hang on any single rest."
@@ -101,7 +103,5 @@ def _bars(f: Influence, gone: set[int]) -> str:
     held = np.array([int(label) in gone for label in labels], dtype=bool)
     notes = ["left out in part already" if h else "" for h in held]
     titles = [bar_title("without rest", t, v, "°", note) for t, v, note in zip(labels, f.value.tolist(), notes)]
-    bars = Bars(
-        f.value[:n], labels, titles, int(np.argmax(f.value[:n])), f.expected, held, np.zeros(n, dtype=bool)
-    )
+    bars = Bars(f.value[:n], labels, titles, int(np.argmax(f.value[:n])), f.expected, held, np.zeros(n, dtype=bool))
     return bar_row(bars, f"How far the {NAMES[f.kind]} moves without each rest, in degrees")

@@ -61,8 +61,8 @@ def worst_pose(all_found: list[Residuals]) -> str:
     among = " of those that were used" if gone else ""
     return text + (
         f"<p><strong>Worst rest{among}: {found.labels[found.worst]}.</strong> Its {NAMES[found.kind]} is off by "
-        f"{number(abs(found.value[found.worst]), 3)} {esc(found.unit)}, {number(_times_the_others(found), 2)} times the "
-        f"rms of the other rests; it {stands}.</p>"
+        f"{number(abs(found.value[found.worst]), 3)} {esc(found.unit)}, {number(_times_the_others(found), 2)} times "
+        f"the rms of the other rests; it {stands}.</p>"
     )
 
 

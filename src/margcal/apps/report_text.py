@@ -93,7 +93,9 @@ def degrees(value: float | None) -> str:
     """An angle with two significant digits, three where it begins with 1."""
     if value is None:
         return "–"
-    return f"{number(value, 3) if value >= 10 else fixed(value, 1 if value >= 3 else 2 if value >= 0.1 else 3)}°"
+    if value >= 10 or value < 0.01:
+        return f"{number(value, 3 if value >= 10 else 2)}°"
+    return f"{fixed(value, 1 if value >= 3 else 2 if value >= 0.1 else 3)}°"
 
 
 def plural(n: int, one: str, many: str | None = None) -> str:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Level = Literal["note", "warn", "fail"]
 Verdict = Literal["pass", "warn", "fail"]
 

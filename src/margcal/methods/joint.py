@@ -44,6 +44,9 @@ FIRST_S_ROT = np.radians(0.3)
 """Start of the attitude error s_rot, rad, before it is estimated."""
 CHECKABLE = 0.02
 """Redundancy below which a residual says nothing of an error (the other readings do not check it)."""
+PRIOR_DOF = 4.0
+"""Weight, in residuals, of a sensor's own scatter (component 1) in the estimate of its component: with three
+residuals the component is otherwise a lottery, and every tenth node far too sure of itself."""
 COMPONENT_TOL = 1e-3
 """Relative change of a variance component that no longer matters: its own standard error is above 5 %."""
 MIN_REDUNDANCY = 3.0
@@ -462,7 +465,9 @@ def _update_components(
         redundancy = _redundancy(b, inverse, parts)
         if redundancy < (LEVEL_REDUNDANCY if b.name == "level" else MIN_REDUNDANCY):
             continue
-        sigma = float(np.sqrt(b.r @ b.r / redundancy))
+        # few residuals tell little: what the scatter within the rests says counts as `PRIOR_DOF` of them
+        told = 0.0 if b.name in ("rot", "level") else PRIOR_DOF
+        sigma = float(np.sqrt((b.r @ b.r + told) / (redundancy + told)))
         sigma = max(sigma, FLOOR.get(b.name, 0.7))
         changed = max(changed, abs(sigma / _sigma(b.name, scale) - 1))
         new[b.name] = sigma

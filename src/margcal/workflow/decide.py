@@ -105,7 +105,7 @@ def _boxed(
     n = len(faces.up)
     tilt = float(np.sqrt(np.mean(faces.tilt_deg**2)))
     seen = len({tuple(c) for c in np.round(faces.up).astype(int).tolist()})
-    about = f"{n} rests on {seen} of 6 faces, tilt {tilt:.1f} deg rms"
+    about = f"{n} rests on {seen} of 6 faces (named after the accelerometer's axes), tilt {tilt:.1f} deg rms"
     figures = {"tilt_rms_deg": tilt, "faces": float(seen)}
     if mode != "faces":
         cube = _cube(recordings, segmentation, options, faces, about, figures)

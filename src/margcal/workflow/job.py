@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class Job:
     def raw_unit(self, kind: Kind) -> str:
         return next(r.streams[kind].unit for r in self.recordings if kind in r.streams)
 
-    def as_named(self, kind: Kind) -> dict[str, object]:
+    def as_named(self, kind: Kind) -> dict[str, Any]:
         """Keywords that name a solver's result."""
         return {"kind": kind, "raw_unit": self.raw_unit(kind), "unit": self.options.unit[kind]}
 

@@ -47,6 +47,10 @@ HANG_NOISY, HANG = 0.5, 8.0
 readings with noise and without."""
 FROZEN_LIMIT = 0.2
 """Share of the samples above which stuck or frozen stretches make a sensor unusable."""
+MEANINGLESS = ("infinite", "too-large", "stuck-sensor", "stuck-axis", "same-axes", "same-readings")
+"""Findings after which nothing more is said of a sensor's unit."""
+LARGEST = 1e18
+"""Readings beyond this come from no converter (64 bits), and their squares from no arithmetic."""
 TEMPERATURE_SPAN = 10.0
 
 
@@ -60,17 +64,16 @@ def lint(recording: Recording) -> tuple[Issue, ...]:
     Returns
     -------
     tuple of Issue
-        By sensor. Codes: ``nan-rows``, ``infinite``, ``too-short``, ``stuck-sensor``, ``stuck-axis``,
-        ``stuck-stretch``, ``frozen-samples``, ``saturated``, ``coarse-quantisation``, ``temperature-span``, and
+        By sensor. Codes: ``nan-rows``, ``infinite``, ``too-large``, ``too-short``, ``stuck-sensor``,
+        ``stuck-axis``, ``stuck-stretch``, ``same-axes``, ``same-readings``, ``frozen-samples``, ``saturated``, ``coarse-quantisation``, ``temperature-span``, and
         those of `lint_clocks` and `lint_units`.
     """
     issues: list[Issue] = []
     for stream in recording.streams.values():
         issues += _lint_stream(stream, recording)
     issues += lint_clocks(recording)
-    unusable: set[Kind | None] = {
-        i.sensor for i in issues if i.level == "fail" and i.code in ("stuck-sensor", "stuck-axis", "infinite")
-    }
+    issues += _lint_copies(recording)
+    unusable: set[Kind | None] = {i.sensor for i in issues if i.level == "fail" and i.code in MEANINGLESS}
     issues += lint_units(recording, unusable)
     issues += _lint_temperature(recording)
     return tuple(issues)
@@ -81,12 +84,16 @@ def _lint_stream(stream: Stream, recording: Recording) -> list[Issue]:
     issues, stream = _lint_missing(stream, where)
     if any(i.code == "infinite" for i in issues):
         return issues
+    if len(stream.y) and not np.abs(stream.y).max() <= LARGEST:
+        worst = float(np.abs(stream.y).max())
+        text = f"{where}: readings up to {worst:.3g} {stream.unit}, which no sensor gives; check how they were exported"
+        return [*issues, Issue("too-large", "fail", text, stream.kind, worst, LARGEST)]
     if len(stream.t) < CLIP_RUN:
         text = f"{where}: {len(stream.t)} readings are too few to say anything; record again"
         return issues or [Issue("too-short", "fail", text, stream.kind, float(len(stream.t)), float(CLIP_RUN))]
     view = view_of(stream, where)
-    issues += _lint_stuck(view)
-    if any(i.code in ("stuck-sensor", "stuck-axis") for i in issues):
+    issues += _lint_stuck(view) or _lint_same_axes(view)
+    if any(i.code in MEANINGLESS for i in issues):
         return issues
     coarse = lint_quantisation(view)
     issues += coarse
@@ -138,6 +145,33 @@ def _lint_stuck(view: View) -> list[Issue]:
         )
         return [Issue("stuck-axis", "fail", text, kind, 0.0, 0.0)]
     return _lint_stuck_stretches(view)
+
+
+def _lint_same_axes(view: View) -> list[Issue]:
+    """Two axes with the same readings: one channel was written twice."""
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        if np.array_equal(view.x[a], view.x[b]):
+            text = (
+                f"{view.where}: {'xyz'[a]} and {'xyz'[b]} hold the same readings; one channel was exported twice: check "
+                "the driver or the export, record again"
+            )
+            return [Issue("same-axes", "fail", text, view.stream.kind)]
+    return []
+
+
+def _lint_copies(recording: Recording) -> list[Issue]:
+    """Two sensors with the same readings: the second one is not what its columns say."""
+    issues = []
+    streams = list(recording.streams.values())
+    for i, stream in enumerate(streams):
+        for other in streams[:i]:
+            if len(stream.y) > CLIP_RUN and np.array_equal(stream.y, other.y) and np.ptp(stream.y) > 0:
+                text = (
+                    f"{recording.source}: the {NAMES[stream.kind]} holds the same readings as the {NAMES[other.kind]}; "
+                    "its columns were exported from the wrong sensor: export again"
+                )
+                issues.append(Issue("same-readings", "fail", text, stream.kind))
+    return issues
 
 
 def _lint_stuck_stretches(view: View) -> list[Issue]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError
-from margcal.core.types import Array, Fit, Issue, Kind, Turn
+from margcal.core.types import Array, Fit, Issue, Kind, Mask, Turn
 from margcal.methods import ellipsoid as by_magnitude
 from margcal.methods import gyro as gyroscope
 from margcal.methods import gyro_paper, transform
@@ -81,7 +81,7 @@ def known(job: Job) -> Solved:
             solved.vectors[kind] = fit.u
     if "acc" in solved.fits and "acc" not in solved.vectors and job.attitudes.level:
         solved.vectors["acc"] = np.array([0.0, 0.0, job.options.gravity])
-    if job.options.pose_method == "gls-ml" and job.options.gyro_method == "gauss-newton":
+    if job.options.pose_method == "gls-ml":
         vertical = job.options.level_sd if job.attitudes.level else None
         _jointly(job, solved, usable_turns(job, usable), Priors(R0=R, vertical_sd=vertical), free_up=True)
     check_full_turns(job, solved)
@@ -381,10 +381,14 @@ def _jointly(
     whole = {k: f for k, f in solved.fits.items() if f.rank >= 9}
     if not whole.keys() & set(poses) or (solved.fits.keys() - whole.keys()):
         return  # a sensor with bias and scale only has no attitudes to share
-    triads = {k: triad_of(job, k, whole[k], solved, triangular, free_up) for k in poses if k in whole}
-    gyro = gyro_of(job, whole["gyr"], _not_full(turns, whole)) if "gyr" in whole else None
     assert solved.R is not None
-    robust = robust_joint(triads, gyro, solved.R, priors)
+    known_R = np.isfinite(solved.R).all(axis=(1, 2))
+    triads = {k: triad_of(job, k, whole[k], solved, triangular, free_up, known_R) for k in poses if k in whole}
+    gyro = None
+    if "gyr" in whole and job.options.gyro_method == "gauss-newton":
+        gyro = gyro_of(job, whole["gyr"], _not_full(turns, whole))
+    R = np.where(known_R[:, None, None], solved.R, np.eye(3))
+    robust = robust_joint(triads, gyro, R, priors)
     if robust.fit.converged and all(np.isfinite(h).all() for h in robust.fit.H.values()):
         solved.singles = dict(solved.fits)
         for out in robust.left_out:
@@ -403,10 +407,11 @@ def _not_full(turns: list[Turn], fits: dict[Kind, Fit]) -> list[Turn]:
     return not_full(turns, fits["gyr"]) if "gyr" in fits and turns else turns
 
 
-def triad_of(job: Job, kind: Kind, fit: Fit, solved: Solved, triangular: bool, free_up: bool) -> Triad:
-    """One sensor's rests as the joint fit takes them, started from `fit`."""
+def triad_of(job: Job, kind: Kind, fit: Fit, solved: Solved, triangular: bool, free_up: bool, usable: Mask) -> Triad:
+    """One sensor's rests as the joint fit takes them, started from `fit`; rests that are not `usable` count as not
+    measured."""
     return Triad(
-        job.segmentation.poses.mean[kind],
+        np.where(usable[:, None], job.segmentation.poses.mean[kind], np.nan),
         standard_error(job, kind),
         np.linalg.inv(fit.model.H),
         fit.model.B,

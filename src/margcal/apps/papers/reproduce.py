@@ -34,6 +34,5 @@ def run(paper: str, *, runs: int, seed: int, output: str | None, overwrite: bool
     if output is None:
         screen.line("nothing was written (-o DIR keeps the tables and draws the figures)")
     else:
-        files = ", ".join(["results.json", "tables.csv", "ours.csv", *sorted(result.pictures)])
-        screen.line(f"written to {Path(output)}: {files}")
+        screen.line(f"written to {Path(output)}: {', '.join(tables.file_names(result))}")
     return 0

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from numpy.typing import ArrayLike
+
 from margcal.apps import screen
+from margcal.workflow.metrics import summary
 
 FACTOR = 1.5
 
 Limit = Literal["", "below", "above"]
+
+Tick = Callable[[int, int], None]
+"""Told how much is done of how much."""
 
 REPRODUCED = "reproduced"
 
@@ -36,6 +42,12 @@ class Figure:
     def text(self) -> str:
         sign = {"": "", "below": "< ", "above": "> "}[self.limit]
         return sign + short(self.mean) + ("" if self.sd is None else f" ± {short(self.sd)}")
+
+
+def figure_of(values: ArrayLike) -> Figure:
+    """Mean and standard deviation of the figures of all runs (runs,)."""
+    found = summary(values)
+    return Figure(found.mean, found.sd)
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,30 @@ class Reproduction:
     tables: tuple[Table | Grid, ...]
     pictures: Mapping[str, str]
     seconds: tuple[Table | Grid, ...] = field(default=())
+
+
+@dataclass
+class Work:
+    """How much is done, in units of about a millisecond."""
+
+    tick: Tick | None
+    total: int
+    done: int = 0
+
+    def of(self, cost: int) -> Callable[[int], None]:
+        def step(n: int) -> None:
+            self.done = min(self.done + cost * n, self.total)
+            if self.tick is not None:
+                self.tick(self.done, self.total)
+
+        return step
+
+
+@dataclass(frozen=True)
+class Part:
+    tables: tuple[Table | Grid, ...]
+    pictures: dict[str, str]
+    seconds: tuple[Table | Grid, ...] = ()
 
 
 def short(value: float) -> str:
@@ -175,16 +211,26 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def file_names(result: Reproduction) -> list[str]:
+    """What `write` writes."""
+    times = ["times.csv"] if result.seconds else []
+    return ["results.json", "tables.csv", "ours.csv", *times, *sorted(result.pictures)]
+
+
 def write(result: Reproduction, folder: Path) -> None:
-    """`results.json`, `tables.csv` (a row a cell), `ours.csv` and the pictures into an existing folder."""
+    """`results.json`, `tables.csv` (a row a cell), `ours.csv`, `times.csv` and the pictures into an existing folder.
+
+    Same runs and seed, same files, but for `times.csv` and the times in `results.json`.
+    """
     from margcal.files.writing import write_table
 
     text = json.dumps(as_plain(result), indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
-    cells = [(t, c) for t in (*result.tables, *result.seconds) if isinstance(t, Table) for c in t.cells]
+    cells = [(t, c) for t in result.tables if isinstance(t, Table) for c in t.cells]
     write_table(folder / "tables.csv", _columns(cells))
-    grids = [t for t in (*result.tables, *result.seconds) if isinstance(t, Grid)]
-    write_table(folder / "ours.csv", _grid_columns(grids))
+    write_table(folder / "ours.csv", _grid_columns([t for t in result.tables if isinstance(t, Grid)]))
+    if result.seconds:
+        write_table(folder / "times.csv", _grid_columns([t for t in result.seconds if isinstance(t, Grid)]))
     for name, svg in result.pictures.items():
         (folder / name).write_text(svg, encoding="utf-8")
 

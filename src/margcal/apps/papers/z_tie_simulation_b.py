@@ -22,6 +22,8 @@ H_G = mounting(0.1, 0.1, 0.1) @ non_orthogonality(0.1, 0.1, 0.1)
 N_TURNS = 9  # between 10 orientations
 RATE = 100  # Hz; each turn lasts 1 s ("usually less than 2 s")
 N_ITER = 50
+N_DRAWS = 21
+"""Sets of turns that are drawn to find a typical one."""
 SETTLED = 12
 """Iterations after which the filter has long stopped (steps below 1e-9); what follows repeats the last."""
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from margcal.apps.papers.figures import BLUE, ORANGE, Panel, figure, histogram
-from margcal.apps.papers.tables import Cell, Figure, Grid, Reproduction, Table, short
+from margcal.apps.papers.tables import Cell, Figure, Grid, Reproduction, Table, Tick, short
 from margcal.core.types import Array, Fit
 from margcal.methods.bounds import cramer_rao
 from margcal.methods.gls import gls_ml
@@ -21,8 +21,6 @@ from margcal.methods.transform import eigen, one_step, svd
 from margcal.workflow.metrics import frobenius, length, rms, share_below, summary
 
 CITATION = "ZY-TBME: Z.-Q. Zhang, G.-Z. Yang, IEEE Trans. Biomed. Eng. 62(2), 2015"
-
-Tick = Callable[[int, int], None]
 
 N_POSES = 30
 SIGMA = math.sqrt(0.1)
