@@ -446,9 +446,16 @@ CASES = [
         has=(("fail", "same-readings", "mag"),),
         without=("mag",),
     ),
-    Case("gyr-is-noise", "10", 0, noise("gyr"), without=("gyr",)),
+    Case(
+        "gyr-is-noise",
+        "10",
+        0,
+        noise("gyr"),
+        without=("gyr",),
+        bug="DataError of the swing's alignment is not caught: one bad sensor takes the good ones along",
+    ),
     Case("mag-is-noise", "10", 0, noise("mag"), without=("mag",)),
-    Case("acc-is-noise", "10", 3, noise("acc"), without=ALL),
+    Case("acc-is-noise", "10", 3, noise("acc"), without=ALL, bug="0 / 0 in core.lsq._damped_step: a RuntimeWarning"),
     Case(
         "absurd-numbers",
         "2",
@@ -644,7 +651,6 @@ CASES = [
         lambda table: {k: np.where(table["t_s"] < 3, 0.0, v) if k.startswith("ref") else v for k, v in table.items()},
         made=few(14, reference=True),
         options=("--poses", "reference"),
-        bug="LinAlgError in joint._tangent: a rest that the reference did not see has R = NaN",
     ),
     Case(
         "reference-not-unit", "33", 1, cell("ref_qw", 9, 3.0), made=few(14, reference=True), says=("norm", "sample 10")

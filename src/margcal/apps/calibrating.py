@@ -116,9 +116,7 @@ def _calibrated(recordings: tuple[Recording, ...], asked: Mapping[str, Any]) -> 
                 found = calibrate(*recordings, **asked, allow_fail=True)
             except DataError:  # refused before any sensor was looked at
                 issues = (*(i for r in recordings for i in r.issues), *refused.issues)
-                found = Calibration(
-                    device=asked.get("device"), verdict="fail", issues=issues, recordings=recordings
-                )
+                found = Calibration(device=asked.get("device"), verdict="fail", issues=issues, recordings=recordings)
     if failure is None and found.verdict == "fail":
         failure = "the verdict is fail: " + "; ".join(i.text for i in found.issues if i.level == "fail")
     return replace(found, created=created_now()), failure

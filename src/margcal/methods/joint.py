@@ -223,7 +223,7 @@ def joint_fit(
         scale["rot"] = priors.s_rot
     state = _start(triads, gyro, R)
     blocks = _blocks(data, state)
-    converged, n_iter = False, 0
+    converged, settled, n_iter = False, not estimate_components, 0
     while not converged and n_iter < max_iter:
         n_iter += 1
         N, g, parts = _normal(blocks, scale, layout.size)
@@ -231,8 +231,10 @@ def joint_fit(
         state, blocks, step = _damped(data, state, blocks, scale, inverse @ g)
         moved = np.max(np.abs(step) / np.sqrt(np.maximum(np.diag(inverse), 1e-300)), initial=0.0)
         changed = 0.0
-        if estimate_components and moved < 1.0:
+        if not settled and moved < 1.0:
             scale, changed = _update_components(blocks, scale, inverse, parts, priors)
+            # two components that trade off creep for ever; once they are settled the unknowns converge at once
+            settled = changed < COMPONENT_TOL and moved < 0.1
         converged = bool(moved < tol and changed < COMPONENT_TOL)
     return _result(data, state, blocks, scale, n_iter, converged)
 

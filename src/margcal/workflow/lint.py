@@ -65,8 +65,8 @@ def lint(recording: Recording) -> tuple[Issue, ...]:
     -------
     tuple of Issue
         By sensor. Codes: ``nan-rows``, ``infinite``, ``too-large``, ``too-short``, ``stuck-sensor``,
-        ``stuck-axis``, ``stuck-stretch``, ``same-axes``, ``same-readings``, ``frozen-samples``, ``saturated``, ``coarse-quantisation``, ``temperature-span``, and
-        those of `lint_clocks` and `lint_units`.
+        ``stuck-axis``, ``stuck-stretch``, ``same-axes``, ``same-readings``, ``frozen-samples``, ``saturated``,
+        ``coarse-quantisation``, ``temperature-span``, and those of `lint_clocks` and `lint_units`.
     """
     issues: list[Issue] = []
     for stream in recording.streams.values():
@@ -86,7 +86,7 @@ def _lint_stream(stream: Stream, recording: Recording) -> list[Issue]:
         return issues
     if len(stream.y) and not np.abs(stream.y).max() <= LARGEST:
         worst = float(np.abs(stream.y).max())
-        text = f"{where}: readings up to {worst:.3g} {stream.unit}, which no sensor gives; check how they were exported"
+        text = f"{where}: readings up to {worst:.3g} {stream.unit}, which no sensor gives; export them again"
         return [*issues, Issue("too-large", "fail", text, stream.kind, worst, LARGEST)]
     if len(stream.t) < CLIP_RUN:
         text = f"{where}: {len(stream.t)} readings are too few to say anything; record again"

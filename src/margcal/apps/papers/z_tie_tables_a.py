@@ -94,8 +94,8 @@ def _table_1(
 
 
 H_UNREACHED = (
-    "no reading reaches Table I's H: it stands at .0149 ± .0022, mean/sd 6.8, where nine isotropic elements allow at "
-    "most 4.2; and in these units u errs by more than H, in the paper by less"
+    "no reading reaches Table I's H: .0149 ± .0022 is mean/sd 6.8, where nine isotropic elements allow 4.2 at most; and "
+    "in these units u errs by more than H, in the paper by less"
 )
 
 
@@ -121,7 +121,7 @@ def _draw_reason(
             f"{len(by_draw)} pose sets give {low} to {high} at iteration {k}: start and pose set of the paper are open"
         )
     if place == 1:
-        return H_UNREACHED
+        return f"{H_UNREACHED}; {len(by_draw)} pose sets give means of {low} to {high}"
     paper_rms = math.hypot(paper.mean, paper.sd or 0.0)
     return (
         f"a floor of {low} to {high} in {len(by_draw)} pose sets; the paper's rms {paper_rms:.4f} lies at the "
