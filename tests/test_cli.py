@@ -403,7 +403,7 @@ def test_ctrl_c_exits_with_130_and_leaves_no_half_file(calibrated, tmp_path):
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, err
     assert out == "" and err == "margcal: interrupted; nothing was left half written\n"
     assert [p.name for p in tmp_path.iterdir()] == ["long.parquet"]
 

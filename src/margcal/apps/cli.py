@@ -129,6 +129,23 @@ def demo(**given: Any) -> int:
 
 @cli.command()
 @click.argument("recordings", nargs=-1, required=True, metavar="RECORDING...")
+@_at
+@click.option("--up", metavar="AXIS", help="Side of the node that was up at the start, such as +z or -x.")
+@_reading
+@_json
+def check(recordings: tuple[str, ...], **given: Any) -> int:
+    """Say what recordings can be used for, before anything is fitted.
+
+    Units, saturation, clocks, rests, coverage, axes that are swapped or mirrored, delays, what is missing.
+    """
+    from margcal.apps.checking import run
+
+    reading = _how_to_read(given)
+    return run(recordings, reading=reading, **given)
+
+
+@cli.command()
+@click.argument("recordings", nargs=-1, required=True, metavar="RECORDING...")
 @_output("POSES.csv", False, "Write the rests as a table that becomes a poses file.")
 @_reading
 @_overwrite

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.apps.report_svg import Scale, percent, plot_row, tick_labels
 from margcal.apps.report_text import number
 from margcal.core.types import Array
 
+Mask = NDArray[np.bool_]
 HEIGHT, TOP, FOOT = 140.0, 10.0, 22.0
 LABEL_ROOM = 0.024
 """Least step between two labels of up to three characters, as a share of the width."""
@@ -42,8 +44,8 @@ class Bars:
     titles: Sequence[str]
     worst: int | None
     level: float | None
-    held: Array
-    out: Array
+    held: Mask
+    out: Mask
 
 
 def bar_row(bars: Bars, title: str) -> str:

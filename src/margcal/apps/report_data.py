@@ -11,11 +11,13 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.core import so3
 from margcal.core.types import Array, Calibration, Fit, Kind, Poses, SensorModel
 from margcal.core.units import STANDARD_GRAVITY
 
+Mask = NDArray[np.bool_]
 FULL_TURN_DEG = (345.0, 375.0)
 
 
@@ -34,7 +36,7 @@ class Residuals:
     unit: str
     by: str
     from_fit: bool
-    out: Array
+    out: Mask
     weight: Array | None = None
 
     @property
@@ -127,15 +129,15 @@ def residuals(calibration: Calibration, kind: Kind) -> Residuals | None:
     )
 
 
-def _read(calibration: Calibration, kind: Kind, labels: tuple[str, ...]) -> Array:
+def _read(calibration: Calibration, kind: Kind, labels: tuple[str, ...]) -> Mask:
     """Whether the sensor was read at the rest of each label: a NaN there is a reading that was left out."""
     poses = calibration.poses
     if poses is None or kind not in poses.mean or len(labels) != len(poses):
         return np.zeros(len(labels), dtype=bool)
-    return np.isfinite(poses.mean[kind]).all(axis=1)
+    return np.isfinite(poses.mean[kind]).all(axis=-1)
 
 
-def _turns_left_out(calibration: Calibration, labels: tuple[str, ...]) -> Array:
+def _turns_left_out(calibration: Calibration, labels: tuple[str, ...]) -> Mask:
     gone = {f"{t[0]}–{t[-1]}" for t in left_out(calibration, "turn-left-out") if len(t) == 2}
     return np.array([label in gone for label in labels], dtype=bool)
 

@@ -19,6 +19,8 @@ from margcal.methods.uncertainty import ExpectedError, direction_ellipses, expec
 
 FULL_CIRCLE_DEG = 90.0
 """An expected error beyond this says that the data determine nothing."""
+OUTSTANDING = 1.4
+"""A direction is marked beyond this many times the rms of all."""
 LARGEST_DRAWN = 0.20
 """Semi-axis (rad) of the largest ellipse in the picture."""
 
@@ -118,7 +120,7 @@ def _node(calibration: Calibration, errors: dict[Kind, ExpectedError]) -> str:
         error, dip, limit = found
         where = f"at rest, from magnetometer and accelerometer, where the field dips by {fixed(dip, 1)}°"
         if limit:
-            where += "; the file does not tell how the errors of the two go together, so this is an upper limit"
+            where += "; how the errors of the two go together is not known, so this is an upper limit"
         rows.append(["Heading", f"{'at most ' if limit else ''}{angle(error)}", where])
     return table(["Node", "Expected, rms", "How"], rows, "expected errors of the node", "node") if rows else ""
 
@@ -162,9 +164,9 @@ def _ellipses(calibration: Calibration, errors: dict[Kind, ExpectedError]) -> st
     times = f"{number(factor, 6)} times" if factor != 1 else "in true size"
     size = "enlarged " if factor > 1 else "drawn at " if factor < 1 else ""
     return (
-        f'<figure class="balls"><figcaption>Where a calibrated reading may lie that belongs at the middle of an ellipse: '
-        f"one standard deviation, {size}{times}, in 26 directions of the calibrated frame. Marked: the largest of each "
-        f'sensor. Pale: on the far side.</figcaption><div class="stills">{pictures}</div></figure>'
+        '<figure class="balls"><figcaption>Where a calibrated reading may lie that belongs at the middle of its ellipse: '
+        f"one standard deviation, {size}{times}, in 26 directions of the calibrated frame. Marked: directions that "
+        f'are much worse than the others. Pale: on the far side.</figcaption><div class="stills">{pictures}</div></figure>'
     )
 
 
@@ -174,10 +176,11 @@ def _ball(kind: Kind, u: Array, axes: Array, factor: float) -> str:
     loops = np.swapaxes(u + factor * rim, 0, 1)
     loops = loops / np.linalg.norm(loops, axis=2, keepdims=True)
     far = (u @ view().T)[:, 2] < 0
-    worst = int(np.argmax(np.linalg.norm(axes, axis=2).max(axis=1)))
+    size = np.sqrt(np.sum(axes**2, axis=(1, 2)))
+    worst = size > OUTSTANDING * np.sqrt(np.mean(size**2))
     order = sorted(range(len(u)), key=lambda i: not far[i])
     drawn = "".join(
-        f'<path class="ellipse{" far" if far[i] else ""}{" worst" if i == worst else ""}" d="{_loop(loops[i])}"/>'
+        f'<path class="ellipse{" far" if far[i] else ""}{" worst" if worst[i] else ""}" d="{_loop(loops[i])}"/>'
         for i in order
     )
     wires = "".join(f'<path class="wire" d="M{_points(line)}"/>' for line in wireframe(12, 5, 40))

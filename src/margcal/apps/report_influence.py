@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.apps.report_bars import Bars, bar_row, bar_title
 from margcal.apps.report_data import left_out, magnitude, residuals
@@ -25,7 +26,7 @@ class Influence:
 
     kind: Kind
     value: Array
-    index: Array
+    index: NDArray[np.intp]
     expected: float | None
     out: frozenset[int]
 

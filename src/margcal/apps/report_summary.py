@@ -71,7 +71,7 @@ def _doubts(calibration: Calibration) -> str:
     if calibration.verdict == "pass":
         return " No check raises a doubt."
     if calibration.verdict == "warn" and _serious(calibration):
-        return " Read first what speaks against it:"
+        return " What speaks against it:"
     if calibration.verdict == "warn":
         return " The verdict is a warning because not every sensor's uncertainty is known."
     return ""
@@ -85,7 +85,7 @@ def _node(calibration: Calibration) -> str:
     error, _, limit = found
     return (
         f" At rest, expect a tilt true within {angle(errors['acc'].direction_deg)} and a heading true within "
-        f"{'at most ' if limit else ''}{angle(error)} rms."
+        f"{angle(error)} rms{' at most' if limit else ''}."
     )
 
 

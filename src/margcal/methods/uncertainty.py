@@ -179,13 +179,14 @@ def heading_error(
 
 def _attitudes() -> tuple[Array, Array, Array]:
     """Up, east and north (n, 3) in the node's frame, evenly over all attitudes."""
-    up = np.repeat(sphere(), AZIMUTHS, axis=0)
+    up: Array = np.repeat(sphere(), AZIMUTHS, axis=0)
     helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
-    a = np.cross(up, helper)
+    a: Array = np.cross(up, helper)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     angle = np.tile(2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SPHERE_POINTS)[:, None]
-    east = np.cos(angle) * a + np.sin(angle) * np.cross(up, a)
-    return up, east, np.cross(up, east)
+    east: Array = np.cos(angle) * a + np.sin(angle) * np.cross(up, a)
+    north: Array = np.cross(up, east)
+    return up, east, north
 
 
 def direction_errors_deg(H: Array, B: Array, H_true: Array, B_true: Array, magnitude: float | None) -> Array:
@@ -248,4 +249,4 @@ def _axis_words(v: Array) -> str:
     if abs(v[k]) > 0.95:
         return f"the {'xyz'[k]} axis"
     v = v * np.sign(v[k])
-    return f"({v[0]:.1f} {v[1]:.1f} {v[2]:.1f})"
+    return "({:.1f} {:.1f} {:.1f})".format(*(np.round(v, 1) + 0.0))  # + 0.0: no minus before a zero

@@ -152,8 +152,8 @@ def _lint_same_axes(view: View) -> list[Issue]:
     for a, b in ((0, 1), (0, 2), (1, 2)):
         if np.array_equal(view.x[a], view.x[b]):
             text = (
-                f"{view.where}: {'xyz'[a]} and {'xyz'[b]} hold the same readings; one channel was exported twice: check "
-                "the driver or the export, record again"
+                f"{view.where}: {'xyz'[a]} and {'xyz'[b]} hold the same readings: one channel was exported twice; "
+                "check the driver or the export, record again"
             )
             return [Issue("same-axes", "fail", text, view.stream.kind)]
     return []

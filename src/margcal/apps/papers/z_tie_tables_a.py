@@ -94,8 +94,8 @@ def _table_1(
 
 
 H_UNREACHED = (
-    "no reading reaches Table I's H: .0149 ± .0022 is mean/sd 6.8, where nine isotropic elements allow 4.2 at most; and "
-    "in these units u errs by more than H, in the paper by less"
+    "no reading reaches Table I's H: .0149 ± .0022 is mean/sd 6.8, where nine isotropic elements allow 4.2 at most; "
+    "and in these units u errs by more than H, in the paper by less"
 )
 
 
