@@ -17,19 +17,29 @@ import pytest
 
 from browser import CHROMIUM, Browser
 from margcal.apps import report_svg, report_text
-from margcal.apps.report import render, with_recordings, write_report
+from margcal.apps.report import render, write_report
 from margcal.apps.report_attitudes import up_name
 from margcal.apps.report_code import c_code, python_code
-from margcal.apps.report_data import attitudes, residuals
+from margcal.apps.report_data import attitudes, left_out, residuals
+from margcal.apps.report_expected import around, enlargement, heading, towards
+from margcal.apps.report_influence import influences
 from margcal.apps.report_parameters import lines, standard_errors
 from margcal.apps.report_sphere import sphere_data
+from margcal.apps.report_text import NAMES, degrees
 from margcal.core import so3
 from margcal.core.errors import InputError
 from margcal.core.types import Calibration, Fit, Issue, Kind, Poses, Recording, SensorModel, Stream, Turn
+from margcal.files.poses_table import PoseTable
 from margcal.methods.sensor_model import describe
+from margcal.methods.uncertainty import expected_error
+from margcal.workflow.calibrate import calibrate
 from margcal.workflow.simulate import Simulation, simulate
 
-ALL = ["findings", "recorded", "attitudes", "sphere", "residuals", "parameters", "apply", "provenance"]
+ALL = [
+    *("findings", "expected", "checks", "recorded", "attitudes", "sphere", "residuals", "influence"),
+    *("parameters", "apply", "provenance"),
+]
+LOADED = ["findings", "expected", "checks", "parameters", "apply", "provenance"]
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\u202e\x1b[31m\"'&--><!--"
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 
@@ -105,8 +115,27 @@ def _covariance(model: SensorModel, relative: float = 1e-3) -> np.ndarray:
     return (A @ A.T) * np.outer(size, size)
 
 
-def _fit(model: SensorModel, residual: np.ndarray) -> Fit:
-    return Fit(model, residual, 0.0, "by hand", cites="nowhere (1) <b>")
+def _fit(model: SensorModel, residual: np.ndarray, **details: np.ndarray) -> Fit:
+    return Fit(model, residual, 0.0, "by hand", cites="nowhere (1) <b>", details=details)
+
+
+CHECKS = [
+    {"code": "expected-error", "sensor": k, "value": 0.123, "limit": 0.5, "level": "pass", "text": f"{k} is good"}
+    for k in ("acc", "gyr", "mag")
+]
+CHECKS += [
+    {"code": "residual", "sensor": "mag", "value": 0.034, "limit": 0.02, "level": "warn", "text": "iron"},
+    {"code": "rests-remaining", "sensor": "acc", "value": 12.0, "limit": 10.0, "level": "pass", "text": "12 remain"},
+    {"code": "housing-error", "sensor": None, "value": None, "limit": None, "level": "fail", "text": "<b>askew</b>"},
+]
+"""As `workflow.checks` leaves them in the settings."""
+
+
+def _shift(model: SensorModel, n: int) -> np.ndarray:
+    """Leave-one-out: rest 3 turns the frame by 1 degree about z, the others by 0.01."""
+    angle = np.radians(np.where(np.arange(n) == 2, 1.0, 0.01))
+    turned = angle[:, None, None] * (so3.skew([0.0, 0.0, 1.0]) @ model.H)
+    return np.column_stack([turned.reshape(n, 9), np.zeros((n, 3))])
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +157,7 @@ def full(simulation: Simulation) -> Calibration:
             model, covariance=_covariance(model), residual_rms=2e-3, n_poses=len(poses), method="by hand",
             expected_error_deg=0.123, delay_s=0.0123 if kind == "mag" else None, delay_se_s=0.001,
         )  # fmt: skip
-        fits[kind] = _fit(models[kind], residual)
+        fits[kind] = _fit(models[kind], residual, leave_one_out=_shift(model, len(poses)))
     return Calibration(
         **models,
         device="node7",
@@ -139,7 +168,13 @@ def full(simulation: Simulation) -> Calibration:
         created="2026-11-20T10:12:00Z",
         program="margcal 9.9.9",
         files=(("session.parquet", "ab" * 32),),
-        settings={"attitudes": "cube", "attitudes_text": "twelve rests, sure", "gravity": 9.80665, "at": [51.5, 0.1]},
+        settings={
+            "attitudes": "cube",
+            "attitudes_text": "twelve rests, sure",
+            "gravity": 9.80665,
+            "at": [51.5, 0.1],
+            "checks": CHECKS,
+        },
         fits=fits,
         poses=poses,
         turns=turns,
@@ -190,11 +225,11 @@ def _bare(c: Calibration) -> Calibration:
 
 CASES = {
     "full": (lambda c: c, ALL),
-    "alone": (_alone, ["findings", "parameters", "apply", "provenance"]),
+    "alone": (_alone, LOADED),
     "bare": (_bare, ["findings", "parameters", "apply", "provenance"]),
     "without-magnetometer": (_without_magnetometer, ALL),
     "accelerometer-only": (lambda c: replace(_without_magnetometer(c), gyr=None), ALL),
-    "swing": (_swing, [s for s in ALL if s != "attitudes"]),
+    "swing": (_swing, [s for s in ALL if s not in ("attitudes", "influence")]),
     "million-samples": (_million, ALL),
     "no-attitudes": (lambda c: replace(c, poses=replace(c.poses, R=None)), ALL),
     "nothing-calibrated": (
@@ -446,17 +481,143 @@ def test_data_block_cannot_be_left() -> None:
 
 
 def test_verdict_comes_first(full: Calibration) -> None:
+    """Then its reasons, then the figures; notes further down."""
     text = render(replace(full, verdict="warn"))
-    assert text.index("Passed with warnings") < text.index('class="cards"') < text.index('id="findings"')
+    places = [
+        text.index(s) for s in ("Usable, with warnings", "Look here", 'class="cards"', 'id="findings"', ": a note")
+    ]
+    assert places == sorted(places)
+    assert text.count("Look here") == 1
 
 
-def test_recordings_beside_a_loaded_calibration(full: Calibration, simulation: Simulation) -> None:
-    c = with_recordings(_alone(full), simulation.recording)
-    assert c.poses is not None and len(c.poses) == 12
-    page = Page(render(c))
-    assert page.sections == ALL
-    other = replace(simulation.recording, mag=replace(simulation.recording.streams["mag"], unit="uT"))
-    assert with_recordings(_alone(full), other).recordings[0].mag is None
+@pytest.mark.parametrize(
+    "verdict, says, says_not",
+    [
+        ("pass", "No check raises a doubt", "What speaks against"),
+        ("warn", "What speaks against it:", "No check raises"),
+        ("fail", "do not apply them", "are calibrated"),
+    ],
+)
+def test_verdict_in_words(full: Calibration, verdict: Any, says: str, says_not: str) -> None:
+    text = " ".join(Page(render(replace(full, verdict=verdict))).text)
+    assert says in text and says_not not in text
+
+
+# --- how far to trust it -----------------------------------------------------------------------------
+
+
+def test_expected_errors_are_those_of_the_covariance(full: Calibration) -> None:
+    body = render(full)
+    for kind, model in full.models.items():
+        assert model.covariance is not None
+        size = float(np.linalg.norm(model.reference_vector)) if kind != "gyr" else 1.0
+        e = expected_error(kind, model.H, model.covariance, size)
+        row = re.search(rf'<th scope="row">{NAMES[kind].capitalize()}</th><td>(.*?)</td><td>(.*?)<', body)
+        assert row is not None
+        assert row.groups() == (degrees(e.direction_deg), degrees(e.worst_direction_deg) + " ")
+
+
+def test_heading_is_a_limit_without_the_fit(full: Calibration) -> None:
+    """The covariance between the two sensors is the fit's; from a file there is an upper limit."""
+    known = replace(full.fits["mag"], details={"covariance_with_acc": np.zeros((12, 12))})
+    error, dip, limit = heading(replace(full, fits={"mag": known})) or (0.0, 0.0, True)
+    assert not limit and dip == pytest.approx(66.5, abs=0.1)
+    worst, _, limit = heading(_alone(full)) or (0.0, 0.0, False)
+    assert limit and worst > error > 0
+    assert "upper limit" in render(_alone(full))
+    assert heading(_without_magnetometer(full)) is None
+
+
+def test_a_node_that_nothing_is_known_of_gets_no_ellipses(full: Calibration) -> None:
+    assert full.acc is not None and full.acc.covariance is not None
+    lost = replace(full.acc, covariance=1e8 * full.acc.covariance, expected_error_deg=4000.0)
+    text = render(replace(full, acc=lost, gyr=None, mag=None))
+    assert "not determined" in text and "do not determine" in text and 'class="balls"' not in text
+
+
+@pytest.mark.parametrize("sd", [3e-7, 1e-3, 0.11, 0.7])
+def test_ellipses_are_enlarged_by_a_round_factor(sd: float) -> None:
+    factor = enlargement(sd)
+    assert 0.08 <= factor * sd <= 0.2 + 1e-9
+    assert f"{factor:.0e}"[0] in "125"
+
+
+def test_ellipses_stand_in_26_directions(full: Calibration) -> None:
+    u = around()
+    assert len(np.unique(u, axis=0)) == 26
+    np.testing.assert_allclose(np.linalg.norm(u, axis=1), 1)
+    assert render(full).count('class="ellipse') == 26 * 3
+    assert towards((0.7, 0.0, -0.7)) == "+x −z" and towards((0.1, -0.99, 0.1)) == "−y"
+
+
+def test_checks_stand_beside_their_limits(full: Calibration) -> None:
+    page = Page(render(full))
+    text = " ".join(page.text)
+    assert "4 of 6 passed" in text
+    for part in ("3.4 %", "≤ 2 %", "≥ 10", "≤ 0.5°"):
+        assert part in text, part
+    assert "askew" not in text  # its words are in a title
+    assert any(a.get("title") == "<b>askew</b>" for _, a in page.tags)
+
+
+@pytest.mark.parametrize(
+    "checks", ["no", {}, [1, None], [{"code": 3, "level": "pass"}], [{"code": HOSTILE, "level": "warn", "value": "1"}]]
+)
+def test_checks_of_anybodys_file(full: Calibration, checks: Any) -> None:
+    text = render(replace(full, settings={"checks": checks}))
+    assert "<img" not in text
+    Page(text)
+
+
+def test_most_influential_rest_is_named(full: Calibration) -> None:
+    found = influences(full)
+    assert [f.kind for f in found] == list(full.models)
+    for f in found:
+        assert f.largest == 3
+        assert f.value[2] == pytest.approx(np.sqrt(2 / 3), rel=1e-3)  # one degree about one axis, over the sphere
+    text = " ".join(Page(render(full)).text)
+    assert "Most influential: rest 3." in text and "hangs on it" in text
+
+
+def test_left_out_rests_are_drawn_as_left_out(full: Calibration) -> None:
+    fits = dict(full.fits)
+    residual = fits["mag"].residual.copy()
+    residual[[4, 7]] = np.nan
+    fits["mag"] = replace(fits["mag"], residual=residual)
+    turn = "turn from rest 5 to 6 ends 31.0 degrees from where the rests lie; it was left out"
+    issues = (
+        Issue("turn-left-out", "warn", turn, "gyr"),
+        Issue("label-left-out", "warn", "rest 9 lay 89.6 degrees from", None),
+    )
+    c = replace(full, fits=fits, issues=issues)
+    mag, gyr = residuals(c, "mag"), residuals(c, "gyr")
+    assert mag is not None and gyr is not None
+    assert mag.labels == tuple(str(i + 1) for i in range(12))
+    assert [t for t, out in zip(mag.labels, mag.out) if out] == ["5", "8"]
+    assert np.isfinite(mag.rms) and mag.labels[mag.worst] not in ("5", "8")
+    assert [t for t, out in zip(gyr.labels, gyr.out) if out] == ["5–6"] and gyr.rms < 8e-3 * np.degrees(1)
+    out = {f.kind: f.out for f in influences(c)}
+    assert out == {"acc": {9}, "gyr": {9}, "mag": {5, 8, 9}}
+    text = render(c)
+    assert text.count('class="left-out"') == 3
+    assert text.count('<li class="framed">') == 1
+    assert "rest 5 (its magnetometer) and rest 8 (its magnetometer)" in text
+    assert not re.search(r"\bnan\b", " ".join(Page(text).text))
+
+
+def test_a_wrong_label_and_a_disturbed_rest_from_data_to_page() -> None:
+    """The numbers are read from the words of the issues: these must keep naming the rest."""
+    simulated = simulate(seed=4, n_poses=18, rest_s=2.0, wrong_label=3, disturbed=11)
+    table = PoseTable(q=so3.quat_from_matrix(simulated.nominal))
+    c = calibrate(simulated.recording, poses=table, level=True)
+    assert left_out(c, "label-left-out") == {(4,)} and left_out(c, "pose-left-out") == {(12,)}
+    found = residuals(c, "mag")
+    assert found is not None and [t for t, out in zip(found.labels, found.out) if out] == ["12"]
+    page = render(c)
+    assert "Left out:</strong> rest 12 (its magnetometer)" in page
+    assert page.count('<li class="framed">') == 1
+    error, _, limit = heading(c) or (0.0, 0.0, True)
+    assert 0 < error < 1 and not limit
 
 
 def test_written_whole_and_never_over_something(full: Calibration, tmp_path: Path) -> None:

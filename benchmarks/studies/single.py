@@ -13,6 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from margcal.core import so3
 from margcal.core.types import Array, Fit
@@ -169,7 +170,7 @@ def bad_pose_study(runs: int, *, seed: int = 6, J: int = 20, s_rot_deg: float = 
 
 def faulty_nodes(
     fault: str, runs: int, J: int, s_rot_deg: float, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, NDArray[np.int64]]:
     """Readings (runs, J, 3), the labels they are given (runs, J, 3, 3), and which pose is bad (runs,)."""
     R = random_poses(runs * J, rng).reshape(runs, J, 3, 3)
     turn = so3.exp(-np.radians(s_rot_deg) * rng.normal(size=(runs, J, 3)))

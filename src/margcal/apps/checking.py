@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,8 @@ def run(
 def _show(found: Inspection, sources: Sequence[str], paths: Sequence[str]) -> None:
     screen.line(f"{', '.join(sources)}: {found.conclusion}", style=LEVEL_STYLE[found.level])
     screen.line()
-    rows = [_row(f, sensors) for f, sensors in _merged(found.findings)]
+    alone = sources[0] if len(sources) == 1 else ""
+    rows = [_row(f, sensors) for f, sensors in _merged([_local(f, alone) for f in found.findings])]
     screen.table(["check", "sensor", "result", "value", "limit", "what was found"], rows, right=(3, 4))
     if found.next_steps:
         screen.line()
@@ -49,6 +50,11 @@ def _show(found: Inspection, sources: Sequence[str], paths: Sequence[str]) -> No
             screen.line(f"- {step}")
     if any(c.level != "pass" for c in found.carried):
         screen.line(f"- `margcal plan {' '.join(paths)}` says which attitudes help most")
+
+
+def _local(finding: Finding, source: str) -> Finding:
+    """Without the recording's name, where there is only one."""
+    return replace(finding, text=finding.text.removeprefix(f"{source}: ")) if source else finding
 
 
 def _merged(findings: Sequence[Finding]) -> list[tuple[Finding, str]]:

@@ -301,7 +301,16 @@ def reproduce(paper: str, **given: Any) -> int:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command: run, and leave with the exit status."""
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    # the matrices are small: more BLAS threads only wait for each other (ten times slower on a busy machine)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    status = run(sys.argv[1:] if arguments is None else arguments)
+    if status == INTERRUPTED:
+        # CPython forgets that an interrupt was handled if it struck within an exec() (any dataclass being made), and
+        # would end by SIGINT instead of with our status
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def run(arguments: list[str]) -> int:

@@ -97,7 +97,7 @@ def _expected(calibration: Calibration) -> Section | None:
 
 def _checks(calibration: Calibration) -> Section | None:
     rows = checks_of(calibration)
-    lead = "What the verdict was made from. Each figure stands before its limit."
+    lead = "What the verdict was made from. Below each figure stands its limit."
     return Section("checks", "Checks", lead, checks_table(rows)) if rows else None
 
 
@@ -164,7 +164,7 @@ def _residuals(calibration: Calibration) -> Section | None:
 
 def _influence(calibration: Calibration) -> Section | None:
     found = influences(calibration)
-    lead = "How far the answer moves when a rest is left out. Bars below the dashed line matter less than chance."
+    lead = "How far the answer moves when a rest is left out. Below the dashed line: less than its expected error."
     return Section("influence", "Leaving out a rest", lead, influence(found)) if found else None
 
 

@@ -163,11 +163,12 @@ def _ellipses(calibration: Calibration, errors: dict[Kind, ExpectedError]) -> st
     pictures = "".join(_ball(kind, u, a, factor) for kind, a in axes.items())
     times = f"{number(factor, 6)} times" if factor != 1 else "in true size"
     size = "enlarged " if factor > 1 else "drawn at " if factor < 1 else ""
-    return (
-        '<figure class="balls"><figcaption>Where a calibrated reading may lie that belongs at the middle of its ellipse: '
-        f"one standard deviation, {size}{times}, in 26 directions of the calibrated frame. Marked: directions that "
-        f'are much worse than the others. Pale: on the far side.</figcaption><div class="stills">{pictures}</div></figure>'
+    caption = (
+        "Where a calibrated reading may lie that belongs at the middle of its ellipse: one standard deviation, "
+        f"{size}{times}, in 26 directions of the calibrated frame. Marked: directions that are much worse than the "
+        "others. Pale: on the far side."
     )
+    return f'<figure class="balls"><figcaption>{caption}</figcaption><div class="stills">{pictures}</div></figure>'
 
 
 def _ball(kind: Kind, u: Array, axes: Array, factor: float) -> str:

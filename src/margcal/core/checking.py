@@ -102,7 +102,9 @@ def checked_stream(
         raise InputError(f"{where}: unknown unit {printable(stream.unit)!r}; {kind} may be in {', '.join(UNITS[kind])}")
     if len(stream.t) == 0:
         raise InputError(f"{where}: no samples")
-    if not np.isfinite(stream.y.sum()) and np.isinf(stream.y).any():
+    with np.errstate(over="ignore", invalid="ignore"):
+        complete = bool(np.isfinite(stream.y.sum()))
+    if not complete and np.isinf(stream.y).any():
         row = int(np.argmax(np.isinf(stream.y).any(axis=1)))
         raise InputError(f"{where}: infinite reading in sample {row + 1} (t = {stream.t[row]:.6g} s); take the row out")
     index, issues = _checked_time(stream.t, where, sort=sort, trust_clock=trust_clock)
@@ -226,7 +228,8 @@ def checked_reference(
         t, q, p = t[index], q[index], None if p is None else p[index]
     if np.isinf(q).any() or (p is not None and np.isinf(p).any()):
         raise InputError(f"{where}: infinite values; take the rows out or leave their cells empty")
-    norm = np.linalg.norm(q, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q, axis=1)
     lost = ~(norm > 1e-6)
     norm[lost] = np.nan
     more = _check_norm(norm, t, where)

@@ -150,8 +150,8 @@ def _damped_step(J: Array, r: Array, damping: float) -> tuple[Array, float]:
     """Step in x and the fall of the cost that the linear model predicts for it."""
     scale = column_scales(J)
     U, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
-    s = np.where(s > 1e-13 * s[0], s, np.inf)
-    gradient = U.T @ r
-    filtered = np.where(np.isinf(s), 0.0, s / (s * s + damping))
-    predicted = float(np.sum(np.where(np.isinf(s), 0.0, gradient * gradient)))
+    told = s > 1e-13 * s[0]
+    gradient = np.where(told, U.T @ r, 0.0)
+    filtered = np.divide(s, s * s + damping, out=np.zeros_like(s), where=told)
+    predicted = float(gradient @ gradient)
     return -(Vt.T @ (filtered * gradient)) / scale, predicted

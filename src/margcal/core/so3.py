@@ -66,7 +66,7 @@ def right_jacobian(v: ArrayLike) -> Array:
 
 def left_jacobian_inverse(v: ArrayLike) -> Array:
     """Inverse of `left_jacobian`, for angles below 2 pi."""
-    return np.linalg.inv(left_jacobian(v))
+    return np.asarray(np.linalg.inv(left_jacobian(v)), dtype=np.float64)
 
 
 def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
@@ -102,8 +102,8 @@ def quat_log(q: ArrayLike) -> Array:
 def matrix_from_quat(q: ArrayLike) -> Array:
     """Rotation matrix of quaternion `q`, which is normalised here."""
     q = np.asarray(q, dtype=np.float64)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    w, v = q[..., 0, None, None], q[..., 1:]
+    unit: Array = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, v = unit[..., 0, None, None], unit[..., 1:]
     k = skew(v)
     return np.eye(3) + 2 * w * k + 2 * (k @ k)
 

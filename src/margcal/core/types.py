@@ -122,11 +122,12 @@ class SensorModel:
         ndarray (..., 3), `unit`
         """
         y = np.asarray(y, dtype=np.float64)
-        if self.H.ndim > 2:
-            return np.einsum("...ij,...j->...i", self.H, y - self.B)
-        if y.size < 3 * _BLOCK or not y.flags.c_contiguous:
-            return (y - self.B) @ self.H.T
-        return _apply_blocks(y.reshape(-1, 3), self.H, self.B).reshape(y.shape)
+        with np.errstate(invalid="ignore", over="ignore"):  # a reading that is not finite is no accident here
+            if self.H.ndim > 2:
+                return np.einsum("...ij,...j->...i", self.H, y - self.B)
+            if y.size < 3 * _BLOCK or not y.flags.c_contiguous:
+                return (y - self.B) @ self.H.T
+            return _apply_blocks(y.reshape(-1, 3), self.H, self.B).reshape(y.shape)
 
     def invert(self, u: ArrayLike) -> Array:
         """Raw readings ``y = H^-1 u + B`` that calibrated vectors `u` (..., 3) came from."""
@@ -271,8 +272,8 @@ class Recording:
     @property
     def streams(self) -> dict[Kind, Stream]:
         """The streams that are there, by kind, in the order acc, gyr, mag."""
-        found = {"acc": self.acc, "gyr": self.gyr, "mag": self.mag}
-        return {k: s for k, s in found.items() if s is not None}  # type: ignore[misc]
+        found: dict[Kind, Stream | None] = {"acc": self.acc, "gyr": self.gyr, "mag": self.mag}
+        return {k: s for k, s in found.items() if s is not None}
 
     @property
     def units(self) -> dict[Kind, str]:
@@ -311,7 +312,7 @@ class Recording:
         """
         from margcal.core.checking import checked_recording
 
-        def split(kind: str, value: Any) -> Stream | None:
+        def split(kind: Kind, value: Any) -> Stream | None:
             if value is None:
                 return None
             own_clock = isinstance(value, tuple) and len(value) == 2
@@ -326,7 +327,7 @@ class Recording:
             unit = (units or {}).get(kind)
             if unit is None:
                 raise InputError(f"{kind}: no unit; give units={{'{kind}': 'count'}} or another")
-            return Stream(kind, np.asarray(clock, dtype=np.float64), y, unit)  # type: ignore[arg-type]
+            return Stream(kind, np.asarray(clock, dtype=np.float64), y, unit)
 
         ref = None
         if reference is not None:
@@ -453,8 +454,8 @@ class Calibration:
     @property
     def models(self) -> dict[Kind, SensorModel]:
         """The calibrated sensors by kind, in the order acc, gyr, mag."""
-        found = {"acc": self.acc, "gyr": self.gyr, "mag": self.mag}
-        return {k: m for k, m in found.items() if m is not None}  # type: ignore[misc]
+        found: dict[Kind, SensorModel | None] = {"acc": self.acc, "gyr": self.gyr, "mag": self.mag}
+        return {k: m for k, m in found.items() if m is not None}
 
     def apply(self, recording: Recording) -> Recording:
         """`recording` with every calibrated sensor in SI units.

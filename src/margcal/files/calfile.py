@@ -202,7 +202,14 @@ def _plain(data: bytes, name: str) -> Any:
 
     try:
         text = data.decode("utf-8")
-        return json.loads(text, object_pairs_hook=unique, parse_constant=refuse, parse_float=finite, parse_int=whole)
+        plain = json.loads(text, object_pairs_hook=unique, parse_constant=refuse, parse_float=finite, parse_int=whole)
+        if "\\u" in text:
+            json.dumps(plain, ensure_ascii=False).encode()
+        return plain
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{name}: holds half a character (\\u{ord(error.object[error.start]):04x}), which is no text; write it whole"
+        ) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: is not UTF-8 text at byte {error.start}; this is no JSON file") from error
     except json.JSONDecodeError as error:
@@ -297,7 +304,10 @@ def _covariance_fault(P: Array) -> str | None:
         return f"has a negative variance in row {int(np.argmin(variance)) + 1}"
     sd = np.sqrt(variance)
     scale = np.where(sd > 0, sd, 1.0)
-    correlation = P / np.outer(scale, scale)
+    with np.errstate(over="ignore"):
+        correlation = P / scale[:, None] / scale
+    if not np.isfinite(correlation).all():
+        return "is not positive semidefinite"
     if (correlation[sd == 0] != 0).any():
         return "has a variance of zero with covariances that are not"
     if np.abs(correlation - correlation.T).max() > 1e-6:
@@ -317,7 +327,7 @@ def dumps(calibration: Calibration) -> bytes:
     """
     for model in calibration.models.values():
         check_model(model, "calibration")
-    return (_json(_document(calibration), 0) + "\n").encode(errors="backslashreplace")
+    return (_json(_document(calibration), 0) + "\n").encode(errors="replace")
 
 
 def save(calibration: Calibration, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:

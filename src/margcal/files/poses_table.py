@@ -118,7 +118,8 @@ def _number(columns: dict[str, list[Any]], name: str, file: str) -> Array:
 
 def _quaternions(columns: dict[str, list[Any]], file: str) -> Array:
     q = np.column_stack([_number(columns, c, file) for c in _QUATERNION])
-    norm = np.linalg.norm(q, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q, axis=1)
     wrong = np.abs(norm - 1) > NORM_REFUSED
     if wrong.any():
         row = int(np.argmax(wrong))

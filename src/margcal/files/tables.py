@@ -243,7 +243,9 @@ def _time(t: Array, table: Table) -> Array:
 
 def _sampled(kind: Kind, t: Array, y: Array, unit: str, file: str) -> tuple[Stream | None, list[Issue]]:
     """The rows at which a sensor was sampled, and what is missing beyond its own, slower rate."""
-    if not np.isnan(y.sum()):
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite readings are refused later, by name
+        complete = not np.isnan(y.sum())
+    if complete:
         y.flags.writeable = False
         return Stream(kind, t, y, unit), []
     blank = np.isnan(y)

@@ -151,6 +151,8 @@ class TextLines(io.RawIOBase):
 
     def _clean_blocks(self) -> Iterator[bytes]:
         for block in self._whole_lines():
+            if self.encoding == "utf-8" and not block.isascii():
+                block = _as_utf8(block)
             if b"\0" in block:
                 line = self.lines + block.count(b"\n", 0, block.index(b"\0")) + 1
                 raise InputError(
@@ -183,6 +185,24 @@ class TextLines(io.RawIOBase):
                 )
             kept.append(line)
         return b"".join(kept)
+
+
+def _as_utf8(block: bytes) -> bytes:
+    """`block` with lines that are not UTF-8 read as cp1252, which the first block did not show the file to be.
+
+    pyarrow prints a traceback of its own at a ragged row that is not UTF-8.
+    """
+    try:
+        block.decode("utf-8")
+        return block
+    except UnicodeDecodeError:
+        lines = block.split(b"\n")
+    for k, line in enumerate(lines):
+        try:
+            line.decode("utf-8")
+        except UnicodeDecodeError:
+            lines[k] = line.decode("cp1252", errors="replace").encode()
+    return b"\n".join(lines)
 
 
 def _quote_left_open(block: bytes) -> bool:
@@ -289,7 +309,10 @@ def _split(line: str, delimiter: str) -> list[str]:
         return line.split(delimiter)
     import csv
 
-    return next(csv.reader([line], delimiter=delimiter))
+    try:
+        return next(csv.reader([line], delimiter=delimiter))
+    except csv.Error:  # a line end within the line, or a cell beyond csv's limit: pyarrow says what is wrong with it
+        return line.split(delimiter)
 
 
 def _outside_quotes(line: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError
-from margcal.core.types import Array, Issue
+from margcal.core.types import Array, Index, Issue
 from margcal.methods.gyro import propagate_gravity
 from margcal.methods.preintegration import TurnBatch
 
@@ -109,7 +109,7 @@ def rotation_from_rates(t: Array, v: Array, t_gyr: Array, rate: Array, *, delays
     return Alignment(final.Omega, se_deg, float(delay), se, misfit, final.gain)
 
 
-def _jackknife(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Array, delay: float, full: _Solved) -> Array:
+def _jackknife(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Index, delay: float, full: _Solved) -> Array:
     """Standard errors (3,) deg from leaving out one stretch of the motion at a time: misfits that last (a field that
     differs from place to place) are not white, and the formal errors know nothing of them."""
     blocks = np.array_split(np.arange(len(edges) - 1), JACKKNIFE_BLOCKS)
@@ -139,9 +139,9 @@ def _solve(
     v: Array,
     t_gyr: Array,
     rate: Array,
-    edges: Array,
+    edges: Index,
     delay: float,
-    keep: Array | None = None,
+    keep: Index | None = None,
     start: Array | None = None,
 ) -> _Solved:
     """Gyroscope matrix in the magnetometer's frame by propagating the field over windows; Omega is the
@@ -187,7 +187,7 @@ def _too_short() -> Issue:
     return Issue("no-alignment", "fail", text, "mag")
 
 
-def _window_edges(t: Array, v: Array) -> Array:
+def _window_edges(t: Array, v: Array) -> Index:
     """Indices that cut the motion into windows over which the field turned by about `WINDOW_RAD`."""
     unit = v / np.linalg.norm(v, axis=1, keepdims=True)
     edges = [0]
@@ -199,7 +199,7 @@ def _window_edges(t: Array, v: Array) -> Array:
     return np.array(edges)
 
 
-def _windows(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Array) -> tuple[TurnBatch, Array]:
+def _windows(t: Array, v: Array, t_gyr: Array, rate: Array, edges: Index) -> tuple[TurnBatch, Array]:
     """The gyroscope between neighbouring edges, exact to the edge times, and the field along it."""
     lo, hi = t[edges[:-1]], t[edges[1:]]
     middles = np.concatenate([[t_gyr[0]], (t_gyr[1:] + t_gyr[:-1]) / 2, [t_gyr[-1]]])

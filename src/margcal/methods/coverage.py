@@ -56,6 +56,7 @@ def distinct_directions(
         vectors = vectors @ np.asarray(H, dtype=np.float64).T
     left = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
     count, limit = 0, math.cos(math.radians(angle_deg))
+    left = left[np.isfinite(left).all(axis=1) & (np.abs(left).sum(axis=1) > 0)]
     while len(left):
         count += 1
         left = left[left @ left[0] < limit]

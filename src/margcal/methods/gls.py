@@ -206,7 +206,12 @@ def _first_state(p: _Problem, start: Fit, centre: Array, size: Array, free_noise
         return state
     r = _linearise(p, state).r / p.noise
     dof = np.maximum(3 * p.weight.sum(axis=-1) - 14, 1)
-    return replace(state, kappa2=np.maximum(np.einsum("nji,nji,nj->n", r, r, p.weight) / dof, 1e-24))
+    kappa2 = np.einsum("nji,nji,nj->n", r, r, p.weight) / dof
+    return replace(state, kappa2=np.maximum(kappa2, _least_kappa2(p, state.rot2)))
+
+
+def _least_kappa2(p: _Problem, rot2: Array) -> Array:
+    return np.maximum(MIN_NOISE**2 * rot2, LEAST_NOISE**2) / np.mean(p.noise**2, axis=(-1, -2))
 
 
 def _solve(p: _Problem, state: _State, free: tuple[bool, bool], max_iter: int) -> tuple[_State, int]:
@@ -318,8 +323,7 @@ def _reml(p: _Problem, at: _Linear, state: _State, free: tuple[bool, bool]) -> t
     theta = np.stack([state.kappa2, state.rot2], axis=-1)
     new = np.where(free, np.clip(theta + step, 0.2 * theta, 5 * theta + 1e-12), theta)
     rot2 = np.clip(new[:, 1], MIN_S_ROT**2, MAX_S_ROT**2) if free[1] else new[:, 1]
-    least = MIN_NOISE**2 * rot2 / np.mean(p.noise**2, axis=(-1, -2))
-    return np.maximum(new[:, 0], least) if free[0] else new[:, 0], rot2
+    return np.maximum(new[:, 0], _least_kappa2(p, rot2)) if free[0] else new[:, 0], rot2
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from margcal.core import so3
-from margcal.core.errors import InputError
-from margcal.core.types import Array
+from margcal.core.errors import DataError
+from margcal.core.types import Array, Issue
 from margcal.methods.preintegration import Preintegrated, TurnBatch, preintegrate
 
 _CUT = 4.0  # sigma of a turn's misfit beyond which its weight falls; 1 honest turn in 1000
@@ -341,5 +341,6 @@ def best_run(problem: Problem, starts: Iterable[Array], max_iter: int, tol: floa
         if best.typical <= misfit_limit(problem, best):
             break
     if best is None:
-        raise InputError("no start for the gyroscope's H; give H0, the nominal scale in rad/s per raw unit")
+        text = "gyroscope: the turns give no start for H; record turns about all axes, or give its nominal scale"
+        raise DataError(text, (Issue("no-start", "fail", text, "gyr"),))
     return best

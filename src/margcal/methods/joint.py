@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from margcal.core import so3
-from margcal.core.types import Array, Kind
+from margcal.core.types import Array, Index, Kind
 from margcal.methods.preintegration import TurnBatch, integrate, preintegrate
 
 ANGLE_ERROR = 2e-4
@@ -87,8 +87,8 @@ class Gyro:
     H: Array
     B: Array
     turns: TurnBatch
-    before: Array
-    after: Array
+    before: Index
+    after: Index
     noise_sd: Array
     weight: Array | None = None
 
@@ -160,8 +160,8 @@ class _Layout:
     A: dict[Kind, slice]
     B: dict[Kind, slice]
     u: dict[Kind, slice]
-    R: Array  # (J, 3) columns
-    mask: dict[Kind, Array] = field(default_factory=dict)  # entries of A (or of the gyroscope's H) that are free
+    R: Index  # (J, 3) columns
+    mask: dict[Kind, Index] = field(default_factory=dict)  # entries of A (or of the gyroscope's H) that are free
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class _Block:
     name: str
     r: Array
     J: Array
-    rest: Array  # the rest (or turn) that each row belongs to
+    rest: Index  # the rest (or turn) that each row belongs to
 
 
 def joint_fit(
@@ -247,7 +247,7 @@ def _lay_out(triads: Mapping[Kind, Triad], gyro: Gyro | None, n_rests: int) -> _
     A: dict[Kind, slice] = {}
     B: dict[Kind, slice] = {}
     u: dict[Kind, slice] = {}
-    mask: dict[Kind, Array] = {}
+    mask: dict[Kind, Index] = {}
     kinds: list[tuple[Kind, bool]] = [(k, t.triangular) for k, t in triads.items()]
     if gyro is not None:
         kinds.append(("gyr", False))
@@ -264,8 +264,8 @@ def _lay_out(triads: Mapping[Kind, Triad], gyro: Gyro | None, n_rests: int) -> _
 
 
 def _start(triads: Mapping[Kind, Triad], gyro: Gyro | None, R: Array) -> _State:
-    A = {k: t.A for k, t in triads.items()}
-    B = {k: t.B for k, t in triads.items()}
+    A: dict[Kind, Array] = {k: t.A for k, t in triads.items()}
+    B: dict[Kind, Array] = {k: t.B for k, t in triads.items()}
     if gyro is not None:
         A["gyr"], B["gyr"] = gyro.H, gyro.B
     return _State(A, B, {k: t.u for k, t in triads.items()}, R)
@@ -381,12 +381,16 @@ def _attitude_block(R0: Array, layout: _Layout, state: _State) -> _Block:
 
 def _level_block(up: Array, level_sd: float, layout: _Layout, state: _State) -> _Block:
     """(v): components of R^T z across the housing direction that is up, over level_sd."""
-    v = state.R[:, 2, :]  # R^T z
-    across = np.stack([_tangent(c).T for c in up])  # (J, 2, 3)
-    r = np.einsum("jkc,jc->jk", across, v) / level_sd
+    rest = np.flatnonzero(np.isfinite(up).all(axis=1))
+    v = state.R[rest, 2, :]  # R^T z
+    across = np.stack([_tangent(c).T for c in up[rest]])  # (J, 2, 3)
+    r = np.einsum("jkc,jc->jk", across, v)
+    # as an angle, up to 180 degrees: a face taken for its opposite must not look level
+    angle = np.arctan2(np.linalg.norm(r, axis=1), np.sum(v * up[rest], axis=1))
+    r *= (angle / np.maximum(np.linalg.norm(r, axis=1), 1e-12))[:, None] / level_sd
     J = np.zeros((len(r), 2, layout.size))
-    _put(J, layout.R, across @ so3.skew(v) / level_sd)
-    return _Block("level", r.ravel(), J.reshape(-1, layout.size), np.repeat(np.arange(len(r)), 2))
+    _put(J, layout.R[rest], across @ so3.skew(v) / level_sd)
+    return _Block("level", r.ravel(), J.reshape(-1, layout.size), np.repeat(rest, 2))
 
 
 def _vertical_block(sd: float, layout: _Layout, state: _State) -> _Block:
@@ -397,7 +401,7 @@ def _vertical_block(sd: float, layout: _Layout, state: _State) -> _Block:
     return _Block("vertical", u[:2] / (np.linalg.norm(u) * sd), J, np.zeros(2, dtype=int))
 
 
-def _put(J: Array, columns: Array, values: Array) -> None:
+def _put(J: Array, columns: Index, values: Array) -> None:
     """``J[i, :, columns[i]] += values[i]`` for the three columns of each rest or turn i."""
     i = np.arange(len(J))
     for k in range(3):
@@ -419,7 +423,7 @@ def _normal(blocks: Sequence[_Block], scale: Mapping[str, float], size: int) -> 
     return np.sum(list(parts.values()), axis=0), g, parts
 
 
-def _inverse(N: Array, angles: Array) -> Array:
+def _inverse(N: Array, angles: Index) -> Array:
     """Pseudo-inverse of the scaled normal matrix: undetermined (gauge) directions stay where they are.
 
     `angles` are the columns of the rests' attitudes. All have one unit, so one that is nothing but rounding (a heading
@@ -515,6 +519,9 @@ def predicted_misfit(
         dR = integrate(gyro.turns.y[index], gyro.turns.dt[index], fit.H["gyr"], fit.B["gyr"])
         net = fit.R[gyro.before[index]].T @ fit.R[gyro.after[index]]
         return chi2, float(so3.angle_between(dR, net))
+    if name == "level":
+        assert priors.up is not None
+        return chi2, float(np.arccos(np.clip(fit.R[index][2] @ priors.up[index], -1.0, 1.0)))
     return chi2, float(np.linalg.norm(block.r[rows]))
 
 
@@ -531,7 +538,7 @@ def _result(
     covariance: dict[Kind, Array] = {}
     residual: dict[Kind, Array] = {}
     for kind in triads:
-        H[kind] = np.linalg.inv(state.A[kind])
+        H[kind] = np.asarray(np.linalg.inv(state.A[kind]), dtype=np.float64)
         covariance[kind] = _model_covariance(layout, inverse, kind, H[kind])
         v = np.einsum("jba,b->ja", state.R, state.u[kind])
         off = (triads[kind].y - state.B[kind]) @ H[kind].T - v
@@ -565,7 +572,7 @@ def _result(
     )
 
 
-def _columns(layout: _Layout, kind: Kind) -> Array:
+def _columns(layout: _Layout, kind: Kind) -> Index:
     return np.r_[layout.A[kind], layout.B[kind]]
 
 

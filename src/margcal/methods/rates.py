@@ -87,7 +87,7 @@ def relate(t: Array, v: Array, t_gyr: Array, z: Array, *, rounds: int = 4) -> Ra
     windows = _cut(t, v, t_gyr, z)
     d, D = 0.0, None
     weight = np.ones(len(windows.change))
-    x = np.zeros(12)
+    x, solved, full = np.zeros(12), np.zeros(13), np.empty((0, 3, 13))
     for k in range(rounds):
         rows = windows.rows(d)
         if D is None:

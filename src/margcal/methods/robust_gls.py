@@ -1,14 +1,18 @@
 """`gls_ml` of one sensor without the poses that contradict the others: wrong labels, disturbed readings.
 
 Not in the papers. The pose that the fit would most like to lose (largest deletion chi-square) is left out, the
-fit is made anew, and the pose is tested against its prediction, with the uncertainty of both. It stays out where
-it misses by more than the largest of J such misfits does by chance; then the next one is looked at. Several
-sensors of one node share their attitudes; `workflow.robust` does the same for them.
+fit is made anew, and the pose is tested against its prediction, with the uncertainty of both: does it miss by more
+than the largest of J such misfits does by chance? Then the next one is looked at. Two bad poses may hide each
+other, since the first is judged by a fit that holds the second; so the search goes on a little after a pose that
+passes, and the last pose that fails decides how many are out (Rosner, Technometrics 25, 1983). Of these, any that
+agrees with the final fit is taken in again. Several sensors of one node share their attitudes; `workflow.robust`
+does the like for them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -23,6 +27,8 @@ FALSE_ALARM = 0.005
 """Probability that a pose is left out of faultless data."""
 MAX_SHARE = 0.3
 """Share of the poses that may be left out; beyond, the data contradict the model."""
+LOOK_AHEAD = 1
+"""Poses that may pass before the search ends."""
 MIN_LEFT = 10
 """Poses that must remain."""
 
@@ -85,33 +91,64 @@ def robust_gls(
         own = None if noise is None else noise[index]
         return gls_ml(nodes[index], turns[index], magnitude, kind=kind, noise_sd=own, s_rot=s_rot, use=use)
 
-    n = len(nodes)
+    use, contradictory = _search(fit_of, len(nodes), J)
+    use, chi2, limit = _taken_in_again(fit_of, use)
+    fit = gls_ml(
+        y,
+        R,
+        magnitude,
+        kind=kind,
+        raw_unit=raw_unit,
+        unit=unit,
+        noise_sd=noise_sd,
+        s_rot=s_rot,
+        use=use.reshape(*lead, J),
+    )
+    shape = (*lead, J)
+    return RobustGls(fit, ~use.reshape(shape), chi2.reshape(shape), limit.reshape(shape), contradictory.reshape(lead))
+
+
+_FitOf = Callable[[NDArray[np.intp], NDArray[np.bool_]], Fit]
+"""(nodes, poses that count) -> their fit."""
+
+
+def _search(fit_of: _FitOf, n: int, J: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Poses (n, J) that agree, and the nodes at which more are bad than may be left out."""
     use = np.ones((n, J), dtype=bool)
-    chi2, limit = np.full((n, J), np.nan), np.full((n, J), np.nan)
     contradictory = np.zeros(n, dtype=bool)
-    active = np.arange(n)
-    deletion = fit_of(active, use).details["deletion"]
     most = min(int(MAX_SHARE * J), J - MIN_LEFT)
+    active, trial_use, passed = np.arange(n), use.copy(), np.zeros(n, dtype=int)
+    deletion = fit_of(active, trial_use).details["deletion"]
     while len(active):
         row = np.arange(len(active))
-        suspect = np.argmax(np.where(use[active], deletion, -np.inf), axis=1)
-        without = use[active]
-        without[row, suspect] = False
-        trial = fit_of(active, without)
-        missed = trial.details["deletion"][row, suspect]
-        allowed = largest_misfit(without.sum(axis=1) + 1, trial.details["dof"])
-        bad = missed > allowed
-        full = (~use[active]).sum(axis=1) >= most
-        contradictory[active[bad & full]] = True
-        go = bad & ~full
-        active, suspect = active[go], suspect[go]
-        use[active, suspect] = False
-        chi2[active, suspect], limit[active, suspect] = missed[go], allowed[go]
-        deletion = trial.details["deletion"][go]
-    every = use.reshape(*lead, J)
-    fit = gls_ml(y, R, magnitude, kind=kind, raw_unit=raw_unit, unit=unit, noise_sd=noise_sd, s_rot=s_rot, use=every)
-    shape = (*lead, J)
-    return RobustGls(fit, ~every, chi2.reshape(shape), limit.reshape(shape), contradictory.reshape(lead))
+        suspect = np.argmax(np.where(trial_use, deletion, -np.inf), axis=1)
+        trial_use[row, suspect] = False
+        out = J - trial_use.sum(axis=1)
+        trial = fit_of(active, trial_use)
+        bad = trial.details["deletion"][row, suspect] > largest_misfit(J - out + 1, trial.details["dof"])
+        contradictory[active[bad & (out > most)]] = True
+        found = bad & (out <= most)
+        use[active[found]] = trial_use[found]
+        passed = np.where(bad, 0, passed + 1)
+        on = (passed <= LOOK_AHEAD) & (out <= most)
+        active, trial_use, passed, deletion = active[on], trial_use[on], passed[on], trial.details["deletion"][on]
+    return use, contradictory
+
+
+def _taken_in_again(fit_of: _FitOf, use: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Array, Array]:
+    """`use` with what agrees with the final fit after all; misfit and limit of what stays out."""
+    use = use.copy()
+    chi2, limit = np.full(use.shape, np.nan), np.full(use.shape, np.nan)
+    some = np.flatnonzero(~use.all(axis=1))
+    if not len(some):
+        return use, chi2, limit
+    details = fit_of(some, use[some]).details
+    allowed = np.broadcast_to(largest_misfit(use[some].sum(axis=1) + 1, details["dof"])[:, None], use[some].shape)
+    out = ~use[some] & (details["deletion"] > allowed)
+    use[some] = ~out
+    chi2[some] = np.where(out, details["deletion"], np.nan)
+    limit[some] = np.where(out, allowed, np.nan)
+    return use, chi2, limit
 
 
 def largest_misfit(n: Array, dof: Array) -> Array:

@@ -22,7 +22,8 @@ def assemble(job: Job, solved: Solved, issues: list[Issue], *, keep_failed: bool
     """
     issues = issues + solved.issues
     models: dict[Kind, SensorModel] = {}
-    for kind in (k for k in KINDS if k in solved.fits):
+    found: list[Kind] = [k for k in KINDS if k in solved.fits]
+    for kind in found:
         fit = _signed(job, kind, solved, issues)
         models[kind] = _finished(job, kind, fit, solved)
         solved.fits[kind] = replace(fit, model=models[kind])

@@ -15,7 +15,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError
-from margcal.core.types import Array, Issue
+from margcal.core.types import Array, Index, Issue
 from margcal.methods.ellipsoid import ellipsoid
 from margcal.workflow.segment import Segmentation
 
@@ -86,7 +86,7 @@ def find_faces(y: Array) -> Faces | None:
     centre, radius = _sphere(y)
     if not np.isfinite(radius):
         return None
-    H, B = np.eye(3) / radius, centre
+    H, B, up = np.eye(3) / radius, centre, np.zeros_like(y)
     for _ in range(10):
         v = _unit((y - B) @ H.T)
         up = _snap_to_axes(v)
@@ -124,7 +124,7 @@ def _affine(y: Array, up: Array, H: Array, B: Array) -> tuple[Array, Array]:
         return H, B
     A = np.column_stack([up, np.ones(len(up))])
     x = np.linalg.lstsq(A, y, rcond=None)[0]
-    return np.linalg.inv(x[:3].T), x[3]
+    return np.asarray(np.linalg.inv(x[:3].T), dtype=np.float64), x[3]
 
 
 def _snap_to_axes(v: Array) -> Array:
@@ -149,7 +149,7 @@ def lies_on_faces(faces: Faces | None) -> bool:
 # --- headings ----------------------------------------------------------------------------------------
 
 
-def chain(v: Array, dR: Array, before: Array) -> tuple[Array, Array]:
+def chain(v: Array, dR: Array, before: Index) -> tuple[Array, Index]:
     """Attitudes of the rests from the turns between them, levelled by the accelerometer.
 
     Parameters
@@ -204,7 +204,7 @@ def _heading_choices(up: Array) -> Array:
     return np.round(quarter @ base)
 
 
-def snap_chain(up: Array, dR: Array, before: Array) -> tuple[Array, Array, Array]:
+def snap_chain(up: Array, dR: Array, before: Index) -> tuple[Array, Index, Array]:
     """Cube attitudes from the turns, snapped at every rest so that no error adds up.
 
     Returns
@@ -272,7 +272,7 @@ def headings_from_field(m: Array, up: Array) -> FieldHeadings | None:
     return FieldHeadings(choices[np.arange(len(up)), k % 4], np.degrees(off))
 
 
-def join_pieces(R: Array, piece: Array, field_R: Array | None) -> tuple[Array, float, int]:
+def join_pieces(R: Array, piece: Index, field_R: Array | None) -> tuple[Array, float, int]:
     """Turn every unbroken chain to the magnetometer's common heading, by majority.
 
     Returns

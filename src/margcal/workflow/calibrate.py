@@ -97,6 +97,8 @@ def calibrate(
         raise UsageError("no recording to calibrate from")
     options = _options(recordings, sensors, method, gravity, field, place, level_sd_deg, nominal)
     issues = [i for r in recordings for i in r.issues] + [i for r in recordings for i in lint(r)]
+    _refuse_unreadable(issues, options)
+    issues += () if place is None else place.issues
     lame = {i.sensor for i in issues if i.level == "fail"}
     usable = tuple(measured(replace(r, **{k: None for k in lame if k})) for r in recordings)
     options = replace(options, sensors=tuple(k for k in options.sensors if k not in lame))
@@ -116,6 +118,16 @@ def calibrate(
     return calibration
 
 
+def _refuse_unreadable(issues: list[Issue], options: Options) -> None:
+    """A wrong unit or clocks that do not overlap: nothing can be made of it, whatever is fitted."""
+    for issue in issues:
+        of = issue.code.split("-")[0]  # `acc-unit` concerns the accelerometer only
+        concerned = of not in KINDS or of in options.sensors
+        if issue.level == "fail" and issue.sensor is None and concerned:
+            raise InputError(issue.text)
+    issues[:] = [i for i in issues if not (i.level == "fail" and i.sensor is None)]
+
+
 def _options(
     recordings: Sequence[Recording],
     sensors: Sequence[Kind] | None,
@@ -126,7 +138,7 @@ def _options(
     level_sd_deg: float,
     nominal: Calibration | None,
 ) -> Options:
-    there = [k for k in KINDS if any(k in r.streams for r in recordings)]
+    there: list[Kind] = [k for k in KINDS if any(k in r.streams for r in recordings)]
     for kind in sensors or ():
         if kind not in KINDS:
             raise UsageError(f"sensor {kind!r} is none of {', '.join(KINDS)}")
@@ -142,7 +154,7 @@ def _options(
     _same_units(recordings)
     where = None if place is None else place.field
     return Options(
-        sensors=tuple(k for k in there if sensors is None or k in sensors),  # type: ignore[misc]
+        sensors=tuple(k for k in there if sensors is None or k in sensors),
         pose_method=pose_method,
         gyro_method=gyro_method,
         gravity=_positive("gravity", gravity, 9.0, 11.0) or (place.gravity if place else STANDARD_GRAVITY),
@@ -265,7 +277,7 @@ def _verdict(calibration: Calibration, sensors: Sequence[Kind] | None) -> Verdic
 
 def _refuse(calibration: Calibration, sensors: Sequence[Kind] | None, recordings: Sequence[Recording]) -> None:
     fails = [i for i in calibration.issues if i.level == "fail"]
-    missing = [k for k in (sensors or ()) if k not in calibration.models]
+    missing: list[Kind] = [k for k in (sensors or ()) if k not in calibration.models]
     if calibration.models and not missing:
         return
     which = ", ".join(NAMES[k] for k in missing) or "any sensor"

@@ -39,7 +39,7 @@ class Check:
 
     code: str
     sensor: Kind | None
-    value: float
+    value: float | None
     limit: float
     level: Level | str
     text: str
@@ -92,17 +92,19 @@ def _expected_error(job: Job, model: SensorModel) -> Check:
     name, error = NAMES[model.kind], model.expected_error_deg
     if error is None:
         text = f"{name}: this method gives no uncertainty; use the default method to know how good it is"
-        return Check("no-uncertainty", model.kind, float("nan"), EXPECTED_ERROR_DEG[0], "warn", text)
+        return Check("no-uncertainty", model.kind, None, EXPECTED_ERROR_DEG[0], "warn", text)
     level, limit = _graded(error, EXPECTED_ERROR_DEG)
     text = f"{name}: expected direction error {min(error, 180.0):.2f} degrees rms"
     if level != "pass" and model.covariance is not None:
         weak = weakest_direction(model.kind, model.H, model.covariance, job.options.magnitude[model.kind])
-        text += f" (limit {limit:g}): {weak.text}; {_record_next(model.kind, weak.what)}"
+        text += f" (limit {limit:g}): {weak.text}; {_record_next(model, weak.what)}"
     return Check("expected-error", model.kind, error, limit, level, text)
 
 
-def _record_next(kind: Kind, what: str) -> str:
-    if kind == "gyr":
+def _record_next(model: SensorModel, what: str) -> str:
+    if model.kind == "mag" and model.n_poses is None:
+        return "swing the node longer, about all axes, with the gyroscope running"
+    if model.kind == "gyr":
         return "record more turns of 60 to 270 degrees about all axes, with rests in between"
     if what == "rotation":
         return "turn the housing about a second and a third axis between rests"
@@ -123,8 +125,10 @@ def _residual(job: Job, model: SensorModel) -> Check | None:
     level, limit = _graded(value, RESIDUAL)
     text = f"{name}: residual {value * 100:.2f} % of the magnitude"
     if level != "pass":
-        what = "a magnet or iron near or on the node" if model.kind == "mag" else "moved rests or wrong attitudes"
-        text += f" (limit {limit * 100:g} %): {what}; record again in one place, away from iron"
+        why = "the node moved during its rests, or the attitudes are wrong; put it down and take the hand away"
+        if model.kind == "mag":
+            why = "a magnet or iron near or on the node; record again in one place, away from iron"
+        text += f" (limit {limit * 100:g} %): {why}"
     return Check("residual", model.kind, value, limit, level, text)
 
 
@@ -132,7 +136,8 @@ def _condition(model: SensorModel) -> Check:
     value = float(np.linalg.cond(model.H))
     level, limit = _graded(value, CONDITION)
     text = f"{NAMES[model.kind]}: the gains of its axes differ by a factor of {value:.2f}"
-    text += "" if level == "pass" else "; no healthy sensor does that: look at its channels and units"
+    if level != "pass":
+        text += f" (limit {limit:g}); no healthy sensor does that: look at its channels and units"
     return Check("condition", model.kind, value, limit, level, text)
 
 
@@ -143,8 +148,9 @@ def _gain(model: SensorModel) -> Check | None:
     gains = np.linalg.svd(model.H / factor, compute_uv=False)
     value = float(np.max(np.maximum(gains, 1 / gains)) - 1)
     level, limit = _graded(value, GAIN_OFF)
-    text = f"{NAMES[model.kind]}: gains within {value * 100:.0f} % of what the unit {model.raw_unit} says"
-    text += "" if level == "pass" else f" (limit {limit * 100:g} %): is it the right unit?"
+    text = f"{NAMES[model.kind]}: gains up to {value * 100:.0f} % off what the unit {model.raw_unit} says"
+    if level != "pass":
+        text += f" (limit {limit * 100:g} %): is that the unit of the readings? give it with --units"
     return Check("gain", model.kind, value, limit, level, text)
 
 
@@ -164,7 +170,8 @@ def _methods_agree(job: Job, solved: Solved, model: SensorModel) -> Check | None
     text = f"{NAMES[model.kind]}: closed form and maximum likelihood differ by {value:.2f} degrees"
     level = "pass" if value <= limit else "warn"
     if level == "warn":
-        text += f", {value / expected:.0f} times the expected error: some rests contradict the others; record again"
+        text += f", {value / expected:.0f} times the expected error: some rests contradict the others; see the "
+        text += "worst ones in the report, or record again"
     return Check("methods-agree", model.kind, value, limit, level, text)
 
 
@@ -205,14 +212,15 @@ def _dip(job: Job, solved: Solved) -> Check | None:
 
 def _remaining(job: Job, solved: Solved, kind: Kind) -> Check | None:
     """Rests that are left for a sensor after those that contradict the others."""
-    out = solved.left_out.get("rot", set()) | solved.left_out.get(kind, set())
+    out = set().union(*(solved.left_out.get(what, set()) for what in ("rot", "level", kind)))
     if not out:
         return None
     rests = len(job.segmentation.poses)
     remain = rests - len(out)
-    text = f"{NAMES[kind]}: {len(out)} of {rests} rests contradict the others and were left out; {remain} remain"
+    contradict = "contradicts the others and was" if len(out) == 1 else "contradict the others and were"
+    text = f"{NAMES[kind]}: {len(out)} of {rests} rests {contradict} left out; {remain} remain"
     if remain < MIN_POSES:
-        text += f", {MIN_POSES} are needed to tell who is right: record again, with more rests"
+        text += f", {MIN_POSES} are needed to tell which are right: record again, with more rests"
     level = "pass" if remain >= MIN_POSES else "fail"
     return Check("rests-remaining", kind, float(remain), float(MIN_POSES), level, text)
 
@@ -221,5 +229,5 @@ def _housing(value: float) -> Check:
     level, limit = _graded(value, HOUSING_DEG)
     text = f"the housing lay {value:.2f} degrees rms (each axis) from the attitudes that were taken"
     if level != "pass":
-        text += f" (limit {limit:g}): wrong attitudes, or a housing that does not lie flat; give them with --poses FILE"
+        text += f" (limit {limit:g}): the attitudes are wrong (give them with --poses FILE) or the housing lies badly"
     return Check("housing-error", None, value, limit, level, text)

@@ -9,7 +9,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError, InputError
-from margcal.core.types import Array, Issue, Recording, SensorModel
+from margcal.core.types import Array, Index, Issue, Kind, Recording, SensorModel
 from margcal.methods.gyro import propagate_gravity
 from margcal.methods.preintegration import integrate, pad
 from margcal.workflow import attitudes as att
@@ -85,11 +85,12 @@ def _from_reference(segmentation: Segmentation, level: bool) -> Attitudes | None
 def _boxed(
     recordings: tuple[Recording, ...], segmentation: Segmentation, options: Options, mode: str
 ) -> Attitudes | None:
-    """Faces, and the four headings if they are multiples of ninety degrees; None where it is no box."""
-    y = segmentation.poses.mean.get("acc")
-    faces = None
-    if y is not None and np.isfinite(y).all() and len(y) >= 4:
-        faces = att.find_faces(y)
+    """Faces, and the four headings if they are multiples of ninety degrees; None where it is no box.
+
+    Rests at which the accelerometer was not read (another recording lacks it) have no attitude: NaN.
+    """
+    rests, y = _read(segmentation, "acc")
+    faces = att.find_faces(y) if len(rests) >= 4 else None
     if faces is None or (mode == "auto" and not att.lies_on_faces(faces)):
         if mode == "auto":
             return None
@@ -98,17 +99,18 @@ def _boxed(
     if faces.tilt_deg.max() > 2.5 * att.FACE_TILT_DEG:
         worst = int(np.argmax(faces.tilt_deg))
         text = (
-            f"--poses {mode}: rest {worst + 1} lies {faces.tilt_deg[worst]:.0f} degrees from every face; "
+            f"--poses {mode}: rest {rests[worst] + 1} lies {faces.tilt_deg[worst]:.0f} degrees from every face; "
             "the node was not put down on its faces there: use --poses free, or leave that rest out"
         )
         raise DataError(text, (Issue("no-faces", "fail", text, "acc", float(faces.tilt_deg[worst]), 30.0),))
-    n = len(faces.up)
+    n, without = len(rests), len(segmentation.poses) - len(rests)
     tilt = float(np.sqrt(np.mean(faces.tilt_deg**2)))
     seen = len({tuple(c) for c in np.round(faces.up).astype(int).tolist()})
     about = f"{n} rests on {seen} of 6 faces (named after the accelerometer's axes), tilt {tilt:.1f} deg rms"
+    about += f"; {without} without accelerometer, their attitudes unknown" if without else ""
     figures = {"tilt_rms_deg": tilt, "faces": float(seen)}
     if mode != "faces":
-        cube = _cube(recordings, segmentation, options, faces, about, figures)
+        cube = _cube(recordings, segmentation, options, faces, rests, about, figures)
         if cube is not None:
             return cube
         if mode == "cube":
@@ -117,13 +119,28 @@ def _boxed(
                 "90 degrees; use --poses faces if the box was put down with arbitrary headings"
             )
             raise DataError(text, (Issue("no-cube", "fail", text),))
-    return Attitudes("faces", "housing", up=faces.up, level=True, text=f"{about}, headings free", figures=figures)
+    up = _among(len(segmentation.poses), rests, faces.up)
+    return Attitudes("faces", "housing", up=up, level=True, text=f"{about}, headings free", figures=figures)
+
+
+def _read(segmentation: Segmentation, kind: Kind) -> tuple[Index, Array]:
+    """The rests at which a sensor was read, and its means (J', 3) there."""
+    y = segmentation.poses.mean.get(kind, np.zeros((0, 3)))
+    rests = np.flatnonzero(np.isfinite(y).all(axis=1))
+    return rests, y[rests]
+
+
+def _among(n: int, rests: Index, values: Array) -> Array:
+    """`values` of some rests among all n, NaN at the others."""
+    out = np.full((n, *values.shape[1:]), np.nan)
+    out[rests] = values
+    return out
 
 
 def _why_no_faces(segmentation: Segmentation, recordings: Sequence[Recording]) -> str:
     if not any("acc" in r.streams for r in recordings):
         return "without an accelerometer nobody knows which face is up; give the attitudes in a table"
-    n = len(segmentation.poses)
+    n = len(_read(segmentation, "acc")[0])
     if n < 4:
         return f"{n} rests were found; put the node down on each of its six faces, two seconds each"
     return "the accelerometer's readings at rest lie in one plane; put the node down on all six faces"
@@ -134,11 +151,15 @@ def _cube(
     segmentation: Segmentation,
     options: Options,
     faces: att.Faces,
+    rests: Index,
     about: str,
     figures: dict[str, float],
 ) -> Attitudes | None:
-    """Which of the 24 attitudes each rest has, by gyroscope and magnetometer together; None if it is no cube."""
-    before, dR = _rough_turns(recordings, segmentation, options, faces)
+    """Which of the 24 attitudes each rest has, by gyroscope and magnetometer together; None if it is no cube.
+
+    `faces` are those of `rests`: the accelerometer was read there.
+    """
+    before, dR = _rough_turns(recordings, segmentation, options, faces, rests)
     R, piece, snap = att.snap_chain(faces.up, dR, before)
     by_gyro = len(snap) > 0
     rms = float(np.sqrt(np.mean(snap**2))) if by_gyro else float("nan")
@@ -146,8 +167,8 @@ def _cube(
         return None
     m = segmentation.poses.mean.get("mag")
     field = None
-    if m is not None and np.isfinite(m).all():
-        field = att.headings_from_field(m, faces.up)
+    if m is not None and np.isfinite(m[rests]).all():
+        field = att.headings_from_field(m[rests], faces.up)
     if field is None and (not by_gyro or piece.max() > 0):
         return None
     if not by_gyro:
@@ -169,22 +190,28 @@ def _cube(
                 "the gyroscope was followed"
             )
             found.append(Issue("heading-disagreement", "warn", note, None, agree, 1.0))
-    return Attitudes("cube", "housing", R=R, up=faces.up, level=True, text=text, figures=figures, issues=tuple(found))
+    n = len(segmentation.poses)
+    R, up = _among(n, rests, R), _among(n, rests, faces.up)
+    return Attitudes("cube", "housing", R=R, up=up, level=True, text=text, figures=figures, issues=tuple(found))
 
 
 def _rough_turns(
-    recordings: tuple[Recording, ...], segmentation: Segmentation, options: Options, faces: att.Faces
-) -> tuple[Array, Array]:
-    """Rest before each turn, and the turn's rotation by a gyroscope calibrated roughly, by gravity."""
+    recordings: tuple[Recording, ...],
+    segmentation: Segmentation,
+    options: Options,
+    faces: att.Faces,
+    rests: Index,
+) -> tuple[Index, Array]:
+    """Rest before each turn, as an index in `rests`, and the turn's rotation by a gyroscope calibrated roughly."""
     none = np.zeros(0, dtype=np.int64), np.zeros((0, 3, 3))
     if "gyr" not in segmentation.poses.mean:
         return none
-    job = Job(recordings, segmentation, Attitudes("faces", "housing", up=faces.up), options)
-    turns = usable_turns(job)
+    job = Job(recordings, segmentation, Attitudes("faces", "housing"), options)
+    v = (segmentation.poses.mean["acc"] - faces.B) @ faces.H.T
+    turns = usable_turns(job, np.all(np.isfinite(v), axis=1))
     if len(turns) < MIN_TURNS:
         return none
     y, _ = job.readings("gyr")
-    v = (segmentation.poses.mean["acc"] - faces.B) @ faces.H.T
     samples = along_turns(job, turns, SensorModel("acc", faces.H, faces.B))
     try:
         fit = propagate_gravity(
@@ -198,4 +225,4 @@ def _rough_turns(
     except DataError:
         return none
     batch = pad(turns)
-    return np.array([t.before for t in turns]), integrate(batch.y, batch.dt, fit.model.H, fit.model.B)
+    return np.searchsorted(rests, [t.before for t in turns]), integrate(batch.y, batch.dt, fit.model.H, fit.model.B)

@@ -52,23 +52,26 @@ class Inspection:
     @property
     def conclusion(self) -> str:
         """All of it in one line."""
-        count = {g: sum(f.level == g for f in self.findings) for g in ORDER}
-        if count["fail"]:
-            first = next(f for f in self.findings if f.level == "fail")
-            more = f" (and {count['fail'] - 1} more)" if count["fail"] > 1 else ""
-            return f"not fit for calibration{more}: {first.text}"
-        parts = {level: [NAMES[c.kind] for c in self.carried if c.level == level] for level in ("pass", "warn", "fail")}
+        carries = {f.sensor: f.level for f in self.findings if f.check == "carries"}
+        whole = {c.kind: c.level for c in self.carried}
+        parts: dict[str, list[str]] = {"pass": [], "warn": [], "fail": []}
+        for kind in carries:
+            if kind is not None:
+                parts[whole.get(kind, "fail")].append(NAMES[kind])
         text = ["ready to calibrate: " + _and(parts["pass"])] if parts["pass"] else []
         text += ["in part: " + _and(parts["warn"])] if parts["warn"] else []
         text += ["not: " + _and(parts["fail"])] if parts["fail"] else []
-        if count["warn"]:
-            text.append(f"{count['warn']} warning{'s' if count['warn'] > 1 else ''}")
-        return "; ".join(text) or "nothing to calibrate"
+        for level, word in (("fail", "failure"), ("warn", "warning")):
+            n = sum(f.level == level and f.check != "carries" for f in self.findings)
+            text += [f"{n} {word}{'s' if n > 1 else ''}"] if n else []
+        return "; ".join(text or ["nothing can be calibrated"])
 
     @property
     def next_steps(self) -> tuple[str, ...]:
         """What to do or record next, without repetition, the gravest first."""
         told = [f for g in ("fail", "warn") for f in self.findings if f.level == g and f.todo]
+        if any(c.level != "pass" for c in self.carried):  # that says it already
+            told = [f for f in told if f.check not in ("rests", "turns", "faces", "directions")]
         return tuple(dict.fromkeys(f.todo for f in told))
 
 
@@ -112,9 +115,15 @@ def inspect(*recordings: Recording, place: Place | None = None, up: str | None =
     gains = _gains(usable)
     coverage, carried = inspect_coverage(usable, segmentation, lame, gains)
     findings += coverage
-    findings += inspect_axes(usable, place, up)
+    findings += inspect_axes(_moving(recordings, issues), place, up)
     findings += as_findings(carried, issues)
     return Inspection(_sorted(findings), tuple(carried), segmentation)
+
+
+def _moving(recordings: tuple[Recording, ...], issues: list[Issue]) -> tuple[Recording, ...]:
+    """Recordings with the sensors that were read at all: a saturated one still tells how its axes lie."""
+    dead = {i.sensor: None for i in issues if i.level == "fail" and i.sensor is not None and i.code != "saturated"}
+    return tuple(measured(replace(r, **dead)) for r in recordings)
 
 
 def _gains(recordings: tuple[Recording, ...]) -> dict[Kind, Array]:

@@ -19,6 +19,7 @@ from margcal.workflow.decide import decide
 from margcal.workflow.findings import Finding, graded
 from margcal.workflow.inspect_axes import gyr_bias
 from margcal.workflow.job import NAMES, Job, Options
+from margcal.workflow.lint_units import sphere_of
 from margcal.workflow.segment import Segmentation
 from margcal.workflow.swing import MIN_SWING_SAMPLES
 from margcal.workflow.turns import MIN_TURNS, usable_turns
@@ -28,6 +29,9 @@ AXES_SPREAD = 0.2
 """Least over largest singular value of the stacked turn axes (robustness.md, 5b)."""
 LEAST_TURN_DEG = 30.0
 MIN_ATTITUDES = 8
+SPHERE = 0.25
+"""Misfit of the sphere, and standard error of its radius, up to which its directions are counted (an attached magnet:
+0.21; a node that does not turn: 0.5)."""
 LOOKED_AT = 1500
 """Samples of a swing whose directions are counted."""
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -121,7 +125,9 @@ def _turns(job: Job, gain: Array | None) -> tuple[Finding, float | None]:
     text = f"{n} turns between rests" + (f" ({lost} more left out: saturated)" if lost else "")
     if gain is None:
         level = graded(n >= MIN_TURNS, "warn")
-        return Finding("turns", level, text, "gyr", float(n), float(MIN_TURNS), "", "" if n >= MIN_TURNS else todo), None
+        return Finding(
+            "turns", level, text, "gyr", float(n), float(MIN_TURNS), "", "" if n >= MIN_TURNS else todo
+        ), None
     vectors = _turn_vectors(job, turns, gain)
     angle = np.degrees(np.linalg.norm(vectors, axis=1))
     large = vectors[angle > LEAST_TURN_DEG]
@@ -168,8 +174,9 @@ def _directions(job: Job, kind: Kind) -> Directions:
                 continue
             thin = recording.mag.y[:: max(1, len(recording.mag.y) // LOOKED_AT)]
             thin = thin[np.isfinite(thin).all(axis=1)]
-            if len(thin) > 4:
-                swing = max(swing, distinct_directions(thin))
+            sphere = sphere_of(thin)
+            if sphere is not None and sphere.rms < SPHERE * sphere.radius and sphere.radius_se < SPHERE * sphere.radius:
+                swing = max(swing, distinct_directions(thin, sphere.centre))
     return Directions(rest, swing)
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from margcal.core.errors import DataError
-from margcal.core.types import Array, Fit, Issue, Kind, Recording, SensorModel
+from margcal.core.types import Array, Fit, Index, Issue, Kind, Recording, SensorModel
 from margcal.core.units import STANDARD_GRAVITY
 from margcal.methods.joint import JointFit
 from margcal.workflow.attitudes import Attitudes
 from margcal.workflow.segment import Segmentation
 
+MAX_CONDITION = 1e4
+"""Condition number of H from which it is no model of a sensor at all."""
 NAMES: dict[Kind, str] = {"acc": "accelerometer", "gyr": "gyroscope", "mag": "magnetometer"}
 
 
@@ -52,7 +54,7 @@ class Job:
     def wants(self, kind: Kind) -> bool:
         return kind in self.options.sensors
 
-    def readings(self, kind: Kind) -> tuple[Array, Array]:
+    def readings(self, kind: Kind) -> tuple[Array, Index]:
         """Means (J', 3) of the rests at which the sensor was read, and the indices of these rests."""
         y = self.segmentation.poses.mean.get(kind)
         if y is None:
@@ -92,6 +94,13 @@ class Solved:
             return None
         if not (np.isfinite(fit.model.H).all() and np.isfinite(fit.model.B).all()):
             self.issues.append(Issue("not-finite", "fail", f"{kind}: the fit has no finite solution", kind))
+            return None
+        if np.linalg.cond(fit.model.H) > MAX_CONDITION:
+            text = (
+                f"{NAMES[kind]}: its H came out singular: the rests or turns contradict the attitudes or do not "
+                "determine it; check the attitudes (an inverted quaternion does this), turn the node about all axes"
+            )
+            self.issues.append(Issue("singular", "fail", text, kind))
             return None
         if not fit.converged:
             text = f"{kind}: {fit.text or 'the fit did not converge'}; record more rests in other attitudes"

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from margcal.core.types import Array, Issue, Stream
-
-Mask = NDArray[np.bool_]
+from margcal.core.types import Array, Issue, Mask, Stream
 
 CLIPPED_LIMIT = 1e-3
 """Share of samples that may stand at the end of the scale: below they are left out, above the range is wrong."""

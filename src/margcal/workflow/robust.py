@@ -22,7 +22,7 @@ FALSE_ALARM = 0.005
 """Probability that anything at all is left out of a faultless recording."""
 LOOK_AT = 12.0
 """Fall of the cost, chi-square of 3, from which a suspect is looked at."""
-MATTERS = {"acc": 0.005, "mag": 0.01, "rot": math.radians(0.5), "turn": math.radians(1.0)}
+MATTERS = {"acc": 0.005, "mag": 0.01, "rot": math.radians(0.5), "turn": math.radians(1.0), "level": math.radians(8.0)}
 """Least misfit worth leaving something out for: of a reading relative to its magnitude, of an attitude or turn."""
 MIN_POSES = 10
 """Rests that must remain (conventions of robustness: below, the recording is refused)."""
@@ -90,6 +90,11 @@ def _without(now: RobustFit, name: str, index: int) -> RobustFit:
         R0 = now.priors.R0.copy()
         R0[index] = np.nan
         return replace(now, priors=replace(now.priors, R0=R0))
+    if name == "level":
+        assert now.priors.up is not None
+        up = now.priors.up.copy()
+        up[index] = np.nan
+        return replace(now, priors=replace(now.priors, up=up))
     if name == "turn":
         # the turn stays in the batch, so that numbers keep their meaning, and counts for nothing
         assert now.gyro is not None
@@ -125,19 +130,31 @@ def issues_of(robust: RobustFit, cube: bool) -> list[Issue]:
                 "left out of the gyroscope's fit (a saturated, interrupted or too violent turn)"
             )
             found.append(Issue("turn-left-out", "warn", text, "gyr", out.chi2, out.limit))
+        elif out.what == "level":
+            found.append(_face_issue(robust, out))
         elif out.what == "rot":
             found.append(_label_issue(robust, out, cube))
         else:
             kind: Kind = "acc" if out.what == "acc" else "mag"
             why = (
-                "the field was disturbed there (iron, a phone, another place)"
+                "most likely the field was disturbed there (iron, a phone, another place)"
                 if kind == "mag"
-                else "the node was touched or moved there"
+                else "most likely the node was touched or moved there"
             )
             name = {"acc": "accelerometer", "mag": "magnetometer"}[kind]
             text = f"{name}: rest {number} is off by {out.misfit * 100:.1f} % and was left out: {why}"
             found.append(Issue("pose-left-out", "warn", text, kind, out.chi2, out.limit))
     return found
+
+
+def _face_issue(robust: RobustFit, out: LeftOut) -> Issue:
+    up = robust.fit.R[out.index][2]
+    k = int(np.argmax(np.abs(up)))
+    text = (
+        f"rest {out.index + 1} lay {np.degrees(out.misfit):.1f} degrees from the face that it was given; its label was "
+        f"left out: most likely {'-' if up[k] < 0 else '+'}{'xyz'[k]} was up"
+    )
+    return Issue("label-left-out", "warn", text, None, out.chi2, out.limit)
 
 
 def _label_issue(robust: RobustFit, out: LeftOut, cube: bool) -> Issue:
@@ -153,7 +170,7 @@ def _label_issue(robust: RobustFit, out: LeftOut, cube: bool) -> Issue:
         axes = np.vstack([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
         up = names[int(np.argmax(axes @ nearest[2]))]
         front = names[int(np.argmax(axes @ nearest[1]))]
-        text += f": a wrong label, most likely it is up {up}, front {front}"
+        text += f": a wrong label; most likely right is up {up}, front {front}"
     else:
         text += ": it was put down badly, or moved during the rest"
     return Issue("label-left-out", "warn", text, None, out.chi2, out.limit)

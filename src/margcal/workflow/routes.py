@@ -14,7 +14,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError
-from margcal.core.types import Array, Fit, Issue, Kind, Mask, Turn
+from margcal.core.types import Array, Fit, Index, Issue, Kind, Mask, Turn
 from margcal.methods import ellipsoid as by_magnitude
 from margcal.methods import gyro as gyroscope
 from margcal.methods import gyro_paper, transform
@@ -28,6 +28,7 @@ from margcal.methods.uncertainty import expected_error
 from margcal.workflow import attitudes as att
 from margcal.workflow.job import NAMES, Job, Solved
 from margcal.workflow.robust import issues_of, robust_joint
+from margcal.workflow.segment import quantum
 from margcal.workflow.turns import (
     along_turns,
     check_full_turns,
@@ -58,6 +59,9 @@ MAGNITUDE_SOLVERS: dict[str, Callable[..., Fit]] = {
 GOOD_ENOUGH_DEG = 0.5
 """Expected error up to which nobody looks for a fit with fewer parameters."""
 
+TILTED = 5.0
+"""From how many standard deviations of a rest's tilt on the laboratory's own is to blame."""
+
 GYRO_SOLVERS = ("gauss-newton", "ukf")
 
 
@@ -67,7 +71,7 @@ def known(job: Job) -> Solved:
     R = job.attitudes.R
     assert R is not None
     solved.R = R
-    usable = np.isfinite(R).all(axis=(1, 2))
+    usable: Mask = np.all(np.isfinite(R), axis=(1, 2))
     if job.wants("acc"):
         solved.attempt("acc", lambda: _acc_known(job, R, usable))
     if job.wants("mag"):
@@ -88,7 +92,7 @@ def known(job: Job) -> Solved:
     return solved
 
 
-def _poses(job: Job, kind: Kind, R: Array, usable: Array) -> Fit:
+def _poses(job: Job, kind: Kind, R: Array, usable: Mask) -> Fit:
     y, index = job.readings(kind)
     keep = usable[index]
     y, index = y[keep], index[keep]
@@ -112,15 +116,33 @@ def _own_frames(job: Job, solved: Solved) -> None:
         solved.fits[kind] = replace(fit, model=replace(fit.model, covariance=None), covariance=None)
 
 
-def _acc_known(job: Job, R: Array, usable: Array) -> Fit:
+def _acc_known(job: Job, R: Array, usable: Mask) -> Fit:
     """One-step, and where the table is level its knowledge of "up" too."""
     up = job.attitudes.up
     if not (job.attitudes.level and up is not None and job.options.pose_method == "gls-ml"):
         return _poses(job, "acc", R, usable)
     try:
-        return _level(job, up)
+        fit = _level(job, up)
     except DataError:
         return _poses(job, "acc", R, usable)  # some face never was up: only known headings can carry it
+    if not fit.converged:
+        _refuse_tilted(job, _poses(job, "acc", R, usable))
+    return fit
+
+
+def _refuse_tilted(job: Job, fit: Fit) -> None:
+    """Say so where "up" of the given attitudes is not up, by a `fit` that did not take it for granted."""
+    if fit.u is None:
+        return
+    u = fit.u if np.linalg.det(fit.model.H) > 0 else -fit.u
+    tilt = float(np.degrees(np.arccos(np.clip(u[2] / np.linalg.norm(u), -1, 1))))
+    limit = TILTED * float(np.degrees(job.options.level_sd))
+    if tilt > limit:
+        text = (
+            f"accelerometer: the attitudes' up is {tilt:.0f} degrees off the vertical, so the fit that takes the table "
+            "as level does not converge; leave --level out, or turn the attitudes so that their z is up"
+        )
+        raise DataError(text, (Issue("not-converged", "fail", text, "acc", tilt, limit),))
 
 
 def _level(job: Job, up: Array) -> Fit:
@@ -129,7 +151,7 @@ def _level(job: Job, up: Array) -> Fit:
     return level_prior(y[keep], up[index[keep]], job.options.gravity, job.options.level_sd, **job.as_named("acc"))
 
 
-def _gyr_known(job: Job, R: Array, usable: Array) -> Fit:
+def _gyr_known(job: Job, R: Array, usable: Mask) -> Fit:
     turns = usable_turns(job, usable)
     need_turns(turns)
     bias, spread, sd = gyro_rest(job)
@@ -179,7 +201,7 @@ def free(job: Job) -> Solved:
 def _acc_free(job: Job, solved: Solved) -> Fit:
     """Nine parameters where the directions carry them, else bias and scale factors; the more certain of the two."""
     y, _ = job.readings("acc")
-    nine = six = None
+    nine = six = reason = None
     try:
         nine = by_magnitude.triangular(y, job.options.gravity, **job.as_named("acc"))
         if _acc_error(job, nine) <= GOOD_ENOUGH_DEG:
@@ -189,7 +211,7 @@ def _acc_free(job: Job, solved: Solved) -> Fit:
     try:
         six = by_magnitude.bias_and_scale(y, job.options.gravity, **job.as_named("acc"))
     except DataError:
-        if nine is None:
+        if nine is None and reason is not None:
             raise reason from None
     if six is None or (nine is not None and _acc_error(job, nine) <= _acc_error(job, six)):
         assert nine is not None
@@ -223,7 +245,7 @@ def _with_gravity(job: Job, solved: Solved, priors: Priors, *, triangular: bool)
     y, index = job.readings("acc")
     v = np.full((len(job.segmentation.poses), 3), np.nan)
     v[index] = acc.model.apply(y)
-    turns = usable_turns(job, np.isfinite(v).all(axis=1))
+    turns = usable_turns(job, np.all(np.isfinite(v), axis=1))
     if job.wants("gyr"):
         by_gravity = lambda: _gyr_by_gravity(job, turns, v, acc)  # noqa: E731
         solved.attempt("gyr", lambda: with_nominal(job, acc.model, by_gravity, solved))
@@ -299,14 +321,14 @@ def _gyr_by_gravity(job: Job, turns: list[Turn], v: Array, acc: Fit) -> Fit:
     return without_full_turns(turns, fit, lambda kept: fit_of(kept, fit.model.H))
 
 
-def _attitudes_by_gyro(job: Job, solved: Solved, v: Array) -> tuple[Array, Array]:
+def _attitudes_by_gyro(job: Job, solved: Solved, v: Array) -> tuple[Array, Index]:
     """R_nh of all rests: levelled by the accelerometer, headings by the gyroscope where there is one."""
     gyr = solved.fits.get("gyr")
     filled = np.where(np.isfinite(v), v, np.array([0.0, 0.0, 1.0]))
     if gyr is None:
         return att.chain(filled, np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))
     turns = list(job.segmentation.turns)  # full turns too: they keep the chain together
-    seen = np.isfinite(v).all(axis=1)
+    seen: Mask = np.all(np.isfinite(v), axis=1)
     turns = [t for t in turns if seen[t.before] and seen[t.after]]
     if not turns:
         return att.chain(filled, np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))
@@ -315,7 +337,7 @@ def _attitudes_by_gyro(job: Job, solved: Solved, v: Array) -> tuple[Array, Array
     return att.chain(filled, dR, np.array([t.before for t in turns]))
 
 
-def _mag_by_attitudes(job: Job, R: Array, piece: Array, v: Array) -> Fit:
+def _mag_by_attitudes(job: Job, R: Array, piece: Index, v: Array) -> Fit:
     """One-step on the longest chain that the gyroscope holds together; without one, by the constant dip."""
     y, index = job.readings("mag")
     if not len(index):
@@ -353,7 +375,7 @@ def _mag_by_dip(job: Job, y: Array, v: Array) -> Fit:
     return replace(fit, model=model, u=u, method="ellipsoid+dip", covariance=None)
 
 
-def _turned_to_field(job: Job, fit: Fit, R: Array, piece: Array) -> Array:
+def _turned_to_field(job: Job, fit: Fit, R: Array, piece: Index) -> Array:
     """Turn every chain about the vertical so that its field points where the fit's does."""
     y, index = job.readings("mag")
     assert fit.u is not None
@@ -377,13 +399,15 @@ def _jointly(
 
     `triangular`: the accelerometer defines the frame; `free_up`: the vertical of the laboratory is estimated.
     """
-    poses = ("acc", "mag")
-    whole = {k: f for k, f in solved.fits.items() if f.rank >= 9}
+    poses: tuple[Kind, ...] = ("acc", "mag")
+    whole: dict[Kind, Fit] = {k: f for k, f in solved.fits.items() if f.rank >= 9}
     if not whole.keys() & set(poses) or (solved.fits.keys() - whole.keys()):
         return  # a sensor with bias and scale only has no attitudes to share
     assert solved.R is not None
-    known_R = np.isfinite(solved.R).all(axis=(1, 2))
-    triads = {k: triad_of(job, k, whole[k], solved, triangular, free_up, known_R) for k in poses if k in whole}
+    known_R: Mask = np.all(np.isfinite(solved.R), axis=(1, 2))
+    triads: dict[Kind, Triad] = {
+        k: triad_of(job, k, whole[k], solved, triangular, free_up, known_R) for k in poses if k in whole
+    }
     gyro = None
     if "gyr" in whole and job.options.gyro_method == "gauss-newton":
         gyro = gyro_of(job, whole["gyr"], _not_full(turns, whole))
@@ -413,7 +437,7 @@ def triad_of(job: Job, kind: Kind, fit: Fit, solved: Solved, triangular: bool, f
     return Triad(
         np.where(usable[:, None], job.segmentation.poses.mean[kind], np.nan),
         standard_error(job, kind),
-        np.linalg.inv(fit.model.H),
+        np.asarray(np.linalg.inv(fit.model.H), dtype=np.float64),
         fit.model.B,
         solved.vectors[kind],
         triangular=triangular and kind == "acc",
@@ -437,9 +461,14 @@ def gyro_of(job: Job, fit: Fit, turns: list[Turn]) -> Gyro:
 
 
 def standard_error(job: Job, kind: Kind) -> Array:
-    """Standard error (J, 3) of the rests' means: scatter over sqrt(n), never below a tenth of its median."""
+    """Standard error (J, 3) of the rests' means: scatter over sqrt(n), never below a tenth of its median.
+
+    Where a rest scatters by less than a step of the converter, more samples tell no more: step / sqrt(12).
+    """
     poses = job.segmentation.poses
+    step = max((quantum(r.streams[kind].y) for r in job.recordings if kind in r.streams), default=0.0)
     se = poses.sd[kind] / np.sqrt(np.maximum(poses.count[kind], 1))[:, None]
+    se = np.where(poses.sd[kind] < step / 2, np.maximum(se, step / np.sqrt(12)), se)
     floor = 0.1 * np.nanmedian(se) + 1e-9 * np.nanmax(np.abs(poses.mean[kind]))
     return np.maximum(se, floor)
 

@@ -163,13 +163,13 @@ def noise_floor(stream: Stream) -> float:
     if not np.isfinite(slow).any():
         return float("nan")
     floor = float(np.nanquantile(slow, FLOOR_QUANTILE))
-    quantised = _quantum(y) * np.sqrt(3 / 12)
+    quantised = quantum(y) * np.sqrt(3 / 12)
     quiet = slow <= 1.5 * floor
     noise = max(float(np.nanmedian(fast[quiet])), quantised)
     return max(floor, quantised) if floor <= NOISE_LIKE * noise else float("nan")
 
 
-def _quantum(y: Array) -> float:
+def quantum(y: Array) -> float:
     """Least significant bit: the smallest step between neighbouring values (0 if the data are continuous)."""
     values = np.unique(y[:20_000, 0])
     steps = np.diff(values)

@@ -138,7 +138,10 @@ def try_swing(job: Job, solved: Solved) -> None:
     have = _error(job, solved.fits.get("mag"))
     if have <= GOOD_ENOUGH_DEG:
         return
-    trial = swung(job, Solved(fits={k: f for k, f in solved.fits.items() if k != "mag"}))
+    try:
+        trial = swung(job, Solved(fits={k: f for k, f in solved.fits.items() if k != "mag"}))
+    except DataError:
+        return  # the motion does not tell the magnetometer's frame either
     if _error(job, trial.fits.get("mag")) >= have:
         return
     solved.issues[:] = [i for i in solved.issues if i.sensor != "mag"] + trial.issues

@@ -8,7 +8,7 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError
-from margcal.core.types import Array, Fit, Issue, SensorModel, Turn
+from margcal.core.types import Array, Fit, Issue, Mask, SensorModel, Turn
 from margcal.core.units import UNITS
 from margcal.methods.gyro import mean_bias
 from margcal.methods.gyro_start import full_turns
@@ -29,7 +29,7 @@ MAX_FREE_ERROR_DEG = 1.0
 """Expected error above which the turns alone are not trusted and the nominal gain is taken in."""
 
 
-def usable_turns(job: Job, usable: Array | None = None) -> list[Turn]:
+def usable_turns(job: Job, usable: Mask | None = None) -> list[Turn]:
     """Turns between usable rests whose readings are all there and none at the end of the scale."""
     turns = []
     for turn in job.segmentation.turns:

@@ -275,6 +275,8 @@ def histogram(
         return 100 * np.histogram(v, edges)[0] / max(v.size, 1)
 
     bars = (Bars(label, edges, share(values), colour),)
+    if np.nanmax(values) > upto:
+        x_label += f" (last bar: and above {upto:g})"
     panel = Panel(title, x_label, "share, %", bars=bars, x_range=(0.0, upto), note=note)
     if compare is not None:
         name, other, other_colour = compare
