@@ -203,6 +203,29 @@ def calibrate(recordings: tuple[str, ...], level_sd: float, **given: Any) -> int
 
 
 @cli.command()
+@click.argument("recordings", nargs=-1, metavar="[RECORDING]...")
+@click.option("--box", "hands", flag_value="box", default=None, help="A box that is put down on its faces (default).")
+@click.option("--free", "hands", flag_value="free", help="A node that is held or propped up in any attitude.")
+@click.option("-n", "number", type=int, metavar="N", help="Attitudes.  [default: 18, after recordings 6]")
+@_sensors
+@_at
+@_output("PLAN.svg", False, "Draw the attitudes.")
+@_reading
+@_overwrite
+@_json
+def plan(recordings: tuple[str, ...], **given: Any) -> int:
+    """Say which attitudes to record, or after recordings which to add.
+
+    Without a recording: a first session. With recordings: they are calibrated, and the attitudes that lower the
+    expected error most are listed.
+    """
+    from margcal.apps.planning import run
+
+    reading = _how_to_read(given)
+    return run(recordings, reading=reading, **given)
+
+
+@cli.command()
 @click.argument("calibration", metavar="CAL.json")
 @click.argument("recording", metavar="RECORDING")
 @_output("OUT", True, "A table (.csv, .parquet), or a folder where RECORDING is one.")

@@ -55,9 +55,10 @@ def run(
             made = plan(hands or "box", **({} if number is None else {"n": number}), sensors=wanted or KINDS, dip=dip)
     if output is not None:
         from margcal.apps.planning_svg import drawing
-        from margcal.files.atomic import write_text
+        from margcal.files.atomic import atomic_path
 
-        write_text(output, drawing(made), overwrite=overwrite)
+        with atomic_path(output, overwrite=overwrite) as path:
+            path.write_text(drawing(made), encoding="utf-8")
     if as_json:
         print(json.dumps(_as_plain(made, [r.source for r in read_in], output), indent=2))
     else:
@@ -78,15 +79,17 @@ def _show(made: Plan, sources: Sequence[str], written: str | None) -> None:
     screen.line()
     if made.last is not None:
         last = shown(made, made.last)
-        front = f", {side(last[1])} to the back: that way is the back" if made.hands == "box" else ""
+        front = f", {side(last[1])} to the front" if made.hands == "box" else ""
         screen.line(f"the node lies as in its last rest, {side(last[2])} up{front}")
     rows = [_row(made, i + 1, step) for i, step in enumerate(made.steps)]
     kinds = list(made.after_deg)
-    head = ["", "up", *(["back"] if made.hands == "box" else []), "turn about the node's own axes"]
+    head = ["", "up", *(["front"] if made.hands == "box" else []), "turn about the node's own axes"]
     first = len(head)
     header = [*head, *(f"{k} deg" for k in kinds)]
     screen.table(header, rows, right=(0, *range(first, first + len(kinds))))
     screen.line()
+    if made.hands == "box":
+        screen.line("front: the side that faces one fixed direction of the room, the same in all rests")
     screen.line("deg: expected direction error of each sensor once that rest is recorded")
     screen.line("Two seconds or more at rest, hands off; turn slowly, all of it in one recording, away from iron.")
     if written is not None:
@@ -114,9 +117,9 @@ def _degrees(value: float) -> str:
 
 def _row(made: Plan, number: int, step: Step) -> list[str]:
     R = shown(made, step.R)
-    back = [side(R[1])] if made.hands == "box" else []
+    front = [side(R[1])] if made.hands == "box" else []
     turn = "start" if step.turn is None else turn_words(step.turn)
-    return [str(number), side(R[2]), *back, turn, *(_degrees(v) for v in step.errors_deg.values())]
+    return [str(number), side(R[2]), *front, turn, *(_degrees(v) for v in step.errors_deg.values())]
 
 
 def _as_plain(made: Plan, sources: Sequence[str], written: str | None) -> dict[str, Any]:
@@ -139,7 +142,7 @@ def _attitude(made: Plan, R: Array) -> dict[str, Any]:
     seen = shown(made, R)
     return {
         "up": side(seen[2]),
-        "back": side(seen[1]),
+        "front": side(seen[1]),
         "up_vector": [round(float(v), 6) for v in seen[2]],
         "q_wxyz": [round(float(v), 9) for v in so3.quat_from_matrix(seen)],
     }

@@ -384,12 +384,18 @@ def _level_block(up: Array, level_sd: float, layout: _Layout, state: _State) -> 
     rest = np.flatnonzero(np.isfinite(up).all(axis=1))
     v = state.R[rest, 2, :]  # R^T z
     across = np.stack([_tangent(c).T for c in up[rest]])  # (J, 2, 3)
-    r = np.einsum("jkc,jc->jk", across, v)
+    turned = so3.skew(v)  # dv for a small rotation of R
+    x, dx = np.einsum("jkc,jc->jk", across, v), across @ turned
     # as an angle, up to 180 degrees: a face taken for its opposite must not look level
-    angle = np.arctan2(np.linalg.norm(r, axis=1), np.sum(v * up[rest], axis=1))
-    r *= (angle / np.maximum(np.linalg.norm(r, axis=1), 1e-12))[:, None] / level_sd
+    n, c = np.linalg.norm(x, axis=1), np.sum(v * up[rest], axis=1)
+    safe, angle = np.maximum(n, 1e-9), np.arctan2(n, c)
+    f = np.where(n > 1e-9, angle / safe, 1.0)
+    dn = np.einsum("jk,jkc->jc", x, dx) / safe[:, None]
+    dc = np.einsum("jk,jkc->jc", up[rest], turned)
+    df = (c[:, None] * dn - n[:, None] * dc - f[:, None] * dn) / safe[:, None]
+    r = f[:, None] * x / level_sd
     J = np.zeros((len(r), 2, layout.size))
-    _put(J, layout.R[rest], across @ so3.skew(v) / level_sd)
+    _put(J, layout.R[rest], (f[:, None, None] * dx + x[:, :, None] * df[:, None, :]) / level_sd)
     return _Block("level", r.ravel(), J.reshape(-1, layout.size), np.repeat(rest, 2))
 
 

@@ -54,7 +54,7 @@ class RobustFit:
 
 def robust_joint(triads: Mapping[Kind, Triad], gyro: Gyro | None, R: Array, priors: Priors) -> RobustFit:
     """`joint_fit`, with contradicting rests and turns left out one by one."""
-    now = RobustFit(joint_fit(triads, gyro, R, priors), (), triads, gyro, priors)
+    first = now = RobustFit(joint_fit(triads, gyro, R, priors), (), triads, gyro, priors)
     most = max(1, int(MAX_SHARE * len(R)))
     while len(now.left_out) < most:
         suspect = _suspect(now.fit)
@@ -68,7 +68,23 @@ def robust_joint(triads: Mapping[Kind, Triad], gyro: Gyro | None, R: Array, prio
             break
         found = LeftOut(*suspect, chi2, limit, misfit)
         now = replace(without, fit=trial, left_out=(*now.left_out, found))
-    return now
+    return _taken_in_again(first, now) if len(now.left_out) > 1 else now
+
+
+def _taken_in_again(first: RobustFit, last: RobustFit) -> RobustFit:
+    """`last` with what agrees with it after all: of a wrong label, a good reading may have gone out before it did."""
+    kept = []
+    for out in last.left_out:
+        chi2, misfit = predicted_misfit(last.fit, first.triads, first.gyro, first.priors, out.what, out.index)
+        if chi2 >= out.limit and misfit >= MATTERS[out.what]:
+            kept.append(replace(out, chi2=chi2, misfit=misfit))
+    if len(kept) == len(last.left_out):
+        return replace(last, left_out=tuple(kept))
+    now = first
+    for out in kept:
+        now = _without(now, out.what, out.index)
+    fit = joint_fit(now.triads, now.gyro, last.fit.R, now.priors, components=last.fit.component)
+    return replace(now, fit=fit, left_out=tuple(kept))
 
 
 def _suspect(fit: JointFit) -> tuple[str, int] | None:
