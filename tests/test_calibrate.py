@@ -216,6 +216,16 @@ def test_level_is_taken_from_quaternions_only_when_it_is_said():
     assert np.degrees(np.arccos(calibration.acc.reference_vector[2] / 9.80665)) == pytest.approx(17.2, abs=0.3)
 
 
+def test_level_that_the_attitudes_contradict_is_said_with_the_angle():
+    sim = cube(1)
+    q = so3.quat_from_matrix(so3.exp([np.radians(60.0), 0.0, 0.0]) @ sim.nominal)
+    calibration = calibrate(sim.recording, poses=PoseTable(q=q), level=True)
+    assert set(calibration.models) == {"gyr", "mag"}
+    (issue,) = [i for i in calibration.issues if i.code == "not-converged"]
+    assert issue.sensor == "acc" and "up is 60 degrees off the vertical" in issue.text
+    assert issue.value == pytest.approx(60.0, abs=0.5)
+
+
 # --- several recordings, missing sensors ----------------------------------------------------------------
 
 
@@ -236,6 +246,22 @@ def test_a_sensor_may_be_missing_in_some_recordings():
     assert set(calibration.models) == set(KINDS)
     assert (calibration.acc.n_poses, calibration.mag.n_poses) == (32, 16)
     assert worst(a, calibration) < 0.15
+
+
+@pytest.mark.parametrize("poses", ["auto", "cube", "faces"])
+def test_the_accelerometer_may_be_missing_in_one_recording_of_a_box(poses):
+    """Its rests have no face: the others carry the calibration, whichever recording comes first."""
+    whole = simulate(seed=3, node_seed=1)
+    without = simulate(seed=4, node_seed=1, n_poses=24, rest_s=2, sensors=("mag", "gyr"))
+    calibration = calibrate(without.recording, whole.recording, poses=poses)
+    assert set(calibration.models) == set(KINDS)
+    assert calibration.settings["attitudes"] == ("faces" if poses == "faces" else "cube")
+    assert "24 without accelerometer" in calibration.settings["attitudes_text"]
+    assert calibration.acc.n_poses == 24
+    assert worst(whole, calibration) < 0.15
+    if poses != "faces":
+        known = np.isfinite(calibration.poses.R).all(axis=(1, 2))
+        assert not known[:24].any() and known[24:].all()
 
 
 def test_a_magnetometer_recorded_apart_from_the_accelerometer_is_refused_with_a_reason():

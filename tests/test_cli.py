@@ -70,7 +70,7 @@ def test_help_names_every_solver(capsys):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["check"],  # not built yet: absent
+        ["orient"],  # not built yet: absent
         ["calibrate"],
         ["calibrate", "x.csv", "--nonsense"],
         ["calibrate", "x.csv", "--gravity", "heavy"],

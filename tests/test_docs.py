@@ -69,7 +69,7 @@ def test_examples_run_and_print_what_the_page_says(page, tmp_path, monkeypatch):
     names: dict[str, object] = {}
     printed = None
     blocks = BLOCK.findall(page.read_text(encoding="utf-8"))
-    assert blocks
+    assert blocks or page.name not in ("README.md", "getting-started.md")
     for language, text in blocks:
         if language == "python":
             output = io.StringIO()

@@ -33,6 +33,7 @@ from margcal.files.poses_table import PoseTable
 from margcal.methods.sensor_model import describe
 from margcal.methods.uncertainty import expected_error
 from margcal.workflow.calibrate import calibrate
+from margcal.workflow.place import parse_at
 from margcal.workflow.simulate import Simulation, simulate
 
 ALL = [
@@ -576,7 +577,7 @@ def test_most_influential_rest_is_named(full: Calibration) -> None:
         assert f.largest == 3
         assert f.value[2] == pytest.approx(np.sqrt(2 / 3), rel=1e-3)  # one degree about one axis, over the sphere
     text = " ".join(Page(render(full)).text)
-    assert "Most influential: rest 3." in text and "hangs on it" in text
+    assert "Most influential: rest 3." in text and "leans on it" in text
 
 
 def test_left_out_rests_are_drawn_as_left_out(full: Calibration) -> None:
@@ -601,8 +602,23 @@ def test_left_out_rests_are_drawn_as_left_out(full: Calibration) -> None:
     text = render(c)
     assert text.count('class="left-out"') == 3
     assert text.count('<li class="framed">') == 1
-    assert "rest 5 (its magnetometer) and rest 8 (its magnetometer)" in text
+    assert "rest 5 (its magnetometer), rest 8 (its magnetometer) and rest 9 (its attitude)" in text
     assert not re.search(r"\bnan\b", " ".join(Page(text).text))
+
+
+def test_a_mirrored_magnetometer_has_the_heading_and_influence_of_a_plain_one() -> None:
+    """Its H changes sign after the fit: what is told of errors must follow."""
+    place = parse_at("51.5,-0.1,2026.5")
+    found = []
+    for axes in (None, np.diag([1.0, 1.0, -1.0])):
+        simulated = simulate(seed=8, n_poses=12, rest_s=1.5, mag_axes=axes, place=place)
+        c = calibrate(simulated.recording, poses="cube", place=place)
+        assert c.mag is not None and np.sign(np.linalg.det(c.mag.H)) == (1 if axes is None else -1)
+        error, _, limit = heading(c) or (0.0, 0.0, True)
+        assert not limit
+        found.append((error, next(f.value for f in influences(c) if f.kind == "mag")))
+    assert found[1][0] == pytest.approx(found[0][0], rel=0.1)
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=0.3, atol=0.005)
 
 
 def test_a_wrong_label_and_a_disturbed_rest_from_data_to_page() -> None:
@@ -614,7 +630,7 @@ def test_a_wrong_label_and_a_disturbed_rest_from_data_to_page() -> None:
     found = residuals(c, "mag")
     assert found is not None and [t for t, out in zip(found.labels, found.out) if out] == ["12"]
     page = render(c)
-    assert "Left out:</strong> rest 12 (its magnetometer)" in page
+    assert "Left out:</strong> rest 4 (its attitude) and rest 12 (its magnetometer)" in page
     assert page.count('<li class="framed">') == 1
     error, _, limit = heading(c) or (0.0, 0.0, True)
     assert 0 < error < 1 and not limit

@@ -111,7 +111,7 @@ def _load(path: Path) -> None:
 
     calibration = load(path)
     for model in calibration.models.values():
-        _must(bool(np.isfinite(model.H).all() and np.isfinite(model.invert(model.apply(np.ones(3)))).all()), "no inverse")
+        _must(bool(np.isfinite(model.invert(model.H @ np.ones(3))).all()), "no inverse")
     if calibration.models:
         written = dumps(calibration)
         _must(dumps(loads(written)) == written, "a file that changes when it is written again")
@@ -157,18 +157,23 @@ def write_case(target: str, seed: int, number: int, folder: Path) -> Path:
 
 def outcome_of(target: str, path: Path) -> tuple[str, str]:
     """(outcome, where) of the target's reader on `path`; a warning counts as a crash."""
+    unheard: list[Any] = []  # exceptions that Python only prints: a traceback on the user's screen all the same
+    usual, sys.unraisablehook = sys.unraisablehook, unheard.append
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             RUN[target](path)
+        _must(not unheard, "an exception that was only printed")
         return "accepted", ""
     except MargcalError as error:
         text = str(error)
         if not text.strip() or "\n" in text or "\x1b" in text or len(text) > 2000:
             return "bad message", _place(error)
-        return "refused", ""
+        return ("crash: printed only", _place(error)) if unheard else ("refused", "")
     except Exception as error:
         return f"crash: {type(error).__name__}", f"{_place(error)}: {re.sub(r'[^ -~]', '?', str(error))[:100]}"
+    finally:
+        sys.unraisablehook = usual
 
 
 def _place(error: Exception) -> str:

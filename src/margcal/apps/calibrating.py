@@ -87,7 +87,7 @@ def parse_sensors(text: str | None) -> tuple[Kind, ...] | None:
             raise UsageError(f"--sensors: {name!r} is none of {', '.join(KINDS)}")
     if not names:
         raise UsageError(f"--sensors: name some of {', '.join(KINDS)}")
-    return tuple(k for k in KINDS if k in names)  # type: ignore[misc]
+    return tuple(k for k in KINDS if k in names)
 
 
 def _poses(text: str) -> Any:

@@ -17,9 +17,7 @@ from margcal.workflow.inspect import Inspection, inspect
 LEVEL_STYLE = {"pass": "green", "note": "", "warn": "yellow", "fail": "red"}
 
 
-def run(
-    recordings: Sequence[str], *, at: str | None, up: str | None, as_json: bool, reading: Mapping[str, Any]
-) -> int:
+def run(recordings: Sequence[str], *, at: str | None, up: str | None, as_json: bool, reading: Mapping[str, Any]) -> int:
     """The verb; exit status 3 where a check fails."""
     place = None
     if at is not None:

@@ -17,7 +17,8 @@ from margcal.core import so3
 from margcal.core.errors import UsageError
 from margcal.core.types import Array
 from margcal.core.units import KINDS
-from margcal.workflow.plan import DIP, Hands, Plan, Step, plan, plan_more
+from margcal.workflow.plan import Plan, Step, plan, plan_more
+from margcal.workflow.plan_start import DIP, Hands
 from margcal.workflow.plan_words import side, turn_words
 
 UNKNOWN_DEG = 10.0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from margcal.apps.planning import shown
 from margcal.apps.report_attitudes import SIZE
 from margcal.apps.report_attitudes import _box as box
@@ -59,6 +61,7 @@ def _subtitle(plan: Plan) -> str:
 def _cell(plan: Plan, i: int, step: Step, columns: int) -> str:
     x, y = MARGIN + (i % columns) * WIDE, HEAD + (i // columns) * TALL
     R = shown(plan, step.R)
+    seen = np.diag([-1.0, -1.0, 1.0]) @ R  # from the side that "front" faces
     caption = f"{side(R[2])} up" + (f", {side(R[1])} front" if plan.hands == "box" else "")
     turn = _lines("start here" if step.turn is None else turn_words(step.turn))
     lines = "".join(
@@ -67,11 +70,17 @@ def _cell(plan: Plan, i: int, step: Step, columns: int) -> str:
     return (
         f'<g transform="translate({x} {y})"><rect class="cell" x="1" y="1" width="{WIDE - 6}" height="{TALL - 6}" '
         f'rx="6"/><text class="number" x="8" y="19">{i + 1}</text><text x="28" y="19">{esc(caption)}</text>'
-        f'<svg x="28" y="22" width="106" height="106" viewBox="0 0 {SIZE:g} {SIZE:g}">{box(R)}</svg>{lines}</g>'
+        f'<svg x="28" y="22" width="106" height="106" viewBox="0 0 {SIZE:g} {SIZE:g}">{box(seen)}</svg>{lines}</g>'
     )
 
 
 def _lines(text: str) -> list[str]:
-    """A turn in one line, or two where it is made of two."""
-    parts = text.split(", then ")
-    return ["", text] if len(parts) == 1 else [f"{parts[0]},", f"then {parts[1]}"]
+    """A turn in one line, or two where it is long."""
+    for word in (", then ", " about ("):
+        first, found, last = text.partition(word)
+        if found:
+            return [
+                first + word[: word.index(" ") + 1].rstrip(),
+                word.strip(", ") + ("" if word[-1] == "(" else " ") + last,
+            ]
+    return ["", text]

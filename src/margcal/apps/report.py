@@ -97,7 +97,7 @@ def _expected(calibration: Calibration) -> Section | None:
 
 def _checks(calibration: Calibration) -> Section | None:
     rows = checks_of(calibration)
-    lead = "What the verdict was made from. Below each figure stands its limit."
+    lead = "Figures behind the verdict, each with its limit. What stands under the verdict counts as well."
     return Section("checks", "Checks", lead, checks_table(rows)) if rows else None
 
 
@@ -131,7 +131,7 @@ def _attitudes(calibration: Calibration) -> Section | None:
     if more and isinstance(text, str) and text:
         said += f" {esc(text[:1].upper() + text[1:])}."
     said = f"<p>{said.strip()}</p>" if said else ""
-    gone = {t[0] for t in left_out(calibration, "label-left-out")}
+    gone = _mislabelled(calibration)
     if gone:
         said += (
             '<p class="note">Framed: what was told or taken does not hold there; the attitude drawn is estimated.</p>'
@@ -140,6 +140,11 @@ def _attitudes(calibration: Calibration) -> Section | None:
         said += '<p class="note">Headings are not known: each box is drawn in the heading that turns it least.</p>'
     lead = f"{plural(len(R), 'rest')}, each seen from the same place. The arrow is up."
     return Section("attitudes", "Attitudes taken", lead, said + gallery(R, gone))
+
+
+def _mislabelled(calibration: Calibration) -> set[int]:
+    """Numbers of the rests whose attitude, as told or taken, was left out."""
+    return {t[0] for t in left_out(calibration, "label-left-out")}
 
 
 def _sphere(calibration: Calibration) -> Section | None:
@@ -159,7 +164,12 @@ def _residuals(calibration: Calibration) -> Section | None:
     if not found:
         return None
     lead = "What the calibration does not explain, rest by rest and turn by turn."
-    return Section("residuals", "Residuals", lead, worst_pose(found) + "".join(map(residual_figure, found)))
+    return Section(
+        "residuals",
+        "Residuals",
+        lead,
+        worst_pose(found, _mislabelled(calibration)) + "".join(map(residual_figure, found)),
+    )
 
 
 def _influence(calibration: Calibration) -> Section | None:

@@ -134,7 +134,7 @@ def _read(calibration: Calibration, kind: Kind, labels: tuple[str, ...]) -> Mask
     poses = calibration.poses
     if poses is None or kind not in poses.mean or len(labels) != len(poses):
         return np.zeros(len(labels), dtype=bool)
-    read: Mask = np.isfinite(poses.mean[kind]).all(axis=-1)
+    read: Mask = np.all(np.isfinite(poses.mean[kind]), axis=-1)
     return read
 
 

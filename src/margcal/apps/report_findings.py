@@ -71,7 +71,7 @@ def _sentence(text: str) -> str:
 
 def provenance(calibration: Calibration) -> str:
     """Files with their hashes, settings, methods with their sources, program."""
-    return "".join([_files(calibration), _methods(calibration), _settings(calibration.settings), _program(calibration)])
+    return "".join([_files(calibration), _methods(calibration), _settings(calibration), _program(calibration)])
 
 
 def _files(calibration: Calibration) -> str:
@@ -90,11 +90,13 @@ def _methods(calibration: Calibration) -> str:
     return table(["Sensor", "Method", "Source"][: len(rows[0])], rows, "methods") if rows else ""
 
 
-def _settings(settings: Mapping[str, Any]) -> str:
+def _settings(calibration: Calibration) -> str:
+    settings = calibration.settings
+    told = {"attitudes_text"} if calibration.poses is not None and len(calibration.poses) else set()  # stands above
     rows = [
         [_SETTINGS.get(name) or esc(name, 60), esc(_plain(value), 600)]
         for name, value in settings.items()
-        if name not in _HIDDEN and value not in (None, "", [], {})
+        if name not in _HIDDEN | told and value not in (None, "", [], {})
     ]
     return table(["Setting", "Value"], rows, "settings") if rows else ""
 

@@ -84,7 +84,7 @@ def _most(found: list[Influence]) -> str:
     text += (
         ": the answer does not hang on any single rest."
         if times <= 1
-        else ": the answer hangs on it. More rests in new directions would share the burden."
+        else ": the answer leans on it. More rests near that attitude would share the burden."
     )
     return f"<p>{text}</p>"
 

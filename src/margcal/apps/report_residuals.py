@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from margcal.apps.report_bars import HEIGHT, Bars, bar_row, bar_title, frame, height_of
 from margcal.apps.report_data import Residuals
 from margcal.apps.report_svg import Scale, percent, plot_row, tick_labels
 from margcal.apps.report_text import NAMES, esc, listing, number
-from margcal.core.types import Kind
 
 MAX_BARS = 240
 OUTSTANDING = 3.0
@@ -41,18 +42,21 @@ def _times_the_others(found: Residuals) -> float:
     return abs(float(found.value[found.worst])) / rms if rms > 0 else 1.0
 
 
-def worst_pose(all_found: list[Residuals]) -> str:
-    """The rest that fits worst, named, in a sentence or two (HTML); nothing where there are no rests."""
+def worst_pose(all_found: list[Residuals], labels: Collection[int] = ()) -> str:
+    """The rest that fits worst, named, in a sentence or two (HTML); nothing where there are no rests.
+
+    `labels`: numbers of the rests whose attitude, as told or taken, was left out.
+    """
     at_rest = [f for f in all_found if f.by == "rest"]
-    gone: dict[str, list[Kind]] = {}
+    gone: dict[int, list[str]] = {n: ["attitude"] for n in labels}
     for found in at_rest:
         for label, out in zip(found.labels, found.out):
             if out:
-                gone.setdefault(label, []).append(found.kind)
+                gone.setdefault(int(label), []).append(NAMES[found.kind])
     text = ""
     if gone:
-        told = listing(f"rest {label} (its {listing(NAMES[k] for k in kinds)})" for label, kinds in gone.items())
-        text = f"<p><strong>Left out:</strong> {told}: the readings contradict those of the other rests.</p>"
+        told = listing(f"rest {n} (its {listing(gone[n])})" for n in sorted(gone))
+        text = f"<p><strong>Left out:</strong> {told}, because the other rests contradict it.</p>"
     candidates = [f for f in at_rest if len(f.used) > 1]
     if not candidates:
         return text

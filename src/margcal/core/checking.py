@@ -17,6 +17,9 @@ from margcal.core.errors import InputError
 from margcal.core.types import Array, Issue, Recording, Reference, Stream
 from margcal.core.units import UNITS
 
+LATEST = 1e30
+"""No clock shows more seconds, nor more nanoseconds taken for seconds."""
+
 SLOWEST_STEP = 2.0
 """Median step (s) from which `t_s` is taken for a counter of milliseconds or finer."""
 
@@ -121,6 +124,9 @@ def _checked_time(
     if not np.isfinite(t).all():
         row = int(np.argmin(np.isfinite(t)))
         raise InputError(f"{where}: time of sample {row + 1} is missing or not finite; take the row out")
+    if np.abs(t).max(initial=0.0) > LATEST:
+        row = int(np.argmax(np.abs(t) > LATEST))
+        raise InputError(f"{where}: time of sample {row + 1} is {t[row]:g} s, which no clock shows; take the row out")
     issues: list[Issue] = []
     index = None
     step = np.diff(t)

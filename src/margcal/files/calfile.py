@@ -29,6 +29,8 @@ VERSION = 1
 MAX_BYTES = 20_000_000
 WORST_CONDITION = 20.0
 """Condition number of H above which no sensor was ever healthy: one axis hardly reads, or two are one."""
+LARGEST = 1e60
+"""No sensor's H, its inverse, or the vector that it senses is larger in any unit; beyond, squares overflow."""
 
 
 @cache
@@ -208,7 +210,8 @@ def _plain(data: bytes, name: str) -> Any:
         return plain
     except UnicodeEncodeError as error:
         raise InputError(
-            f"{name}: holds half a character (\\u{ord(error.object[error.start]):04x}), which is no text; write it whole"
+            f"{name}: holds half a character (\\u{ord(error.object[error.start]):04x}), which is no text; "
+            "write it whole"
         ) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: is not UTF-8 text at byte {error.start}; this is no JSON file") from error
@@ -286,6 +289,8 @@ def check_model(model: SensorModel, name: str) -> None:
         if value is not None and not np.isfinite(value).all():
             raise InputError(f"{name}: {field} holds values that are not finite - at `{where}.{field}`")
     largest, _, smallest = np.linalg.svd(model.H, compute_uv=False)
+    if largest > LARGEST or 0 < largest < 1 / LARGEST:
+        raise InputError(f"{name}: H is of size {largest:.3g}, which is no sensor's in any unit - at `{where}.H`")
     if smallest <= 1e-14 * largest:
         raise InputError(f"{name}: H is singular: it maps all readings into a plane - at `{where}.H`")
     if largest > WORST_CONDITION * smallest:
@@ -293,6 +298,9 @@ def check_model(model: SensorModel, name: str) -> None:
             f"{name}: H has condition number {largest / smallest:.3g}, more than {WORST_CONDITION:g}: one axis hardly "
             f"reads, or two axes are nearly one; calibrate again - at `{where}.H`"
         )
+    vector = model.reference_vector
+    if vector is not None and np.abs(vector).max() > LARGEST:
+        raise InputError(f"{name}: is larger than any field or gravity - at `{where}.reference_vector`")
     if model.covariance is not None and (fault := _covariance_fault(model.covariance)):
         raise InputError(f"{name}: covariance {fault} - at `{where}.covariance`")
 
@@ -300,6 +308,8 @@ def check_model(model: SensorModel, name: str) -> None:
 def _covariance_fault(P: Array) -> str | None:
     """Why the matrix is no covariance, judged free of units (as correlations); None if it is one."""
     variance = np.diag(P)
+    if np.abs(P).max() > LARGEST**2:
+        return "holds values that are too large for one"
     if (variance < 0).any():
         return f"has a negative variance in row {int(np.argmin(variance)) + 1}"
     sd = np.sqrt(variance)

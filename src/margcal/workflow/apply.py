@@ -353,7 +353,8 @@ class _Delays:
 
     def _time(self, batch: pa.RecordBatch) -> Array:
         t = numbers(batch.column(self.job.columns.t))
-        wrong = ~(np.diff(t, prepend=self.last) >= 0) | ~np.isfinite(t)
+        with np.errstate(invalid="ignore"):  # inf - inf
+            wrong = ~(np.diff(t, prepend=self.last) >= 0) | ~np.isfinite(t)
         if wrong.any():
             row = self.rows + int(np.argmax(wrong)) + 1
             raise InputError(

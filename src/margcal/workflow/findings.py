@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from margcal.core.types import Issue, Kind
+from margcal.core.units import KINDS
 
 Grade = Literal["pass", "note", "warn", "fail"]
 ORDER: tuple[Grade, ...] = ("fail", "warn", "note", "pass")
@@ -70,8 +71,9 @@ class Finding:
 def from_issue(issue: Issue) -> Finding:
     """An `Issue` of lint, segmentation or reader; its text says what to do already."""
     sensor = issue.sensor
-    if sensor is None and issue.code[:4] in ("acc-", "gyr-", "mag-"):
-        sensor = issue.code[:3]  # type: ignore[assignment]
+    for kind in KINDS:
+        if sensor is None and issue.code.startswith(f"{kind}-"):
+            sensor = kind
     check = CHECK_OF.get(issue.code, issue.code)
     return Finding(check, issue.level, issue.text, sensor, issue.value, issue.limit)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from margcal.core.errors import UsageError
-from margcal.core.types import Array, Issue, Kind, Recording
+from margcal.core.types import Array, Issue, Kind, Mask, Recording
 from margcal.core.units import STANDARD_GRAVITY, UNITS
 from margcal.workflow.findings import ORDER, Finding, from_issue
 from margcal.workflow.inspect_axes import axes_of, inspect_axes
@@ -53,7 +53,7 @@ class Inspection:
     def conclusion(self) -> str:
         """All of it in one line."""
         carries = {f.sensor: f.level for f in self.findings if f.check == "carries"}
-        whole = {c.kind: c.level for c in self.carried}
+        whole: dict[Kind, str] = {c.kind: c.level for c in self.carried}
         parts: dict[str, list[str]] = {"pass": [], "warn": [], "fail": []}
         for kind in carries:
             if kind is not None:
@@ -106,7 +106,7 @@ def inspect(*recordings: Recording, place: Place | None = None, up: str | None =
     if any(i.level == "fail" and i.sensor is None for i in issues):
         return Inspection(_sorted(findings), (), None)
     lame: list[Kind] = [i.sensor for i in issues if i.level == "fail" and i.sensor is not None]
-    usable = tuple(measured(replace(r, **{k: None for k in lame})) for r in recordings)
+    usable = tuple(measured(replace(r, **dict.fromkeys(lame))) for r in recordings)
     usable = tuple(r for r in usable if r.streams)
     if not usable:
         return Inspection(_sorted(findings), (), None)
@@ -223,5 +223,5 @@ def _unit_finding(kind: Kind, recording: Recording) -> Finding:
     return Finding("unit", "pass", f"{name}: {stream.unit}, nothing speaks against it", kind)
 
 
-def _whole(y: Array) -> Array:
-    return np.isfinite(y).all(axis=1)
+def _whole(y: Array) -> Mask:
+    return np.all(np.isfinite(y), axis=1)

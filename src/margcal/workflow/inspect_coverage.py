@@ -16,7 +16,7 @@ from margcal.methods.preintegration import integrate, pad
 from margcal.workflow import attitudes as att
 from margcal.workflow.attitudes import Attitudes
 from margcal.workflow.decide import decide
-from margcal.workflow.findings import Finding, graded
+from margcal.workflow.findings import Finding, Grade, graded
 from margcal.workflow.inspect_axes import gyr_bias
 from margcal.workflow.job import NAMES, Job, Options
 from margcal.workflow.lint_units import sphere_of
@@ -42,7 +42,7 @@ class Carried:
     """What the recordings carry of one sensor: `level` 'pass' (all of it), 'warn' (part), 'fail' (nothing)."""
 
     kind: Kind
-    level: str
+    level: Grade
     text: str
     todo: str = ""
 
@@ -62,7 +62,7 @@ def inspect_coverage(
     gains : mapping
         ``gains['gyr']`` (3, 3): rad/s per raw unit where it is known from the motion.
     """
-    there = [k for k in NAMES if any(k in r.streams for r in recordings) and k not in lame]
+    there: list[Kind] = [k for k in NAMES if any(k in r.streams for r in recordings) and k not in lame]
     options = Options(sensors=tuple(there))
     attitudes, failed = _attitudes(recordings, segmentation, options)
     job = Job(recordings, segmentation, attitudes, options)
@@ -71,7 +71,7 @@ def inspect_coverage(
     if "gyr" in there:
         finding, spread = _turns(job, gains.get("gyr"))
         out.append(finding)
-    directions = {k: _directions(job, k) for k in ("acc", "mag") if k in there}
+    directions: dict[Kind, Directions] = {k: _directions(job, k) for k in there if k != "gyr"}
     faces = _faces(segmentation) if "acc" in there else None
     if faces is not None and attitudes.mode in ("cube", "faces"):
         out.append(_faces_finding(faces))
@@ -197,9 +197,10 @@ def _direction_finding(job: Job, kind: Kind, found: Directions) -> Finding:
 def _faces(segmentation: Segmentation) -> set[str] | None:
     """Names of the faces that were up; None where the rests do not lie on faces."""
     y = segmentation.poses.mean.get("acc")
-    if y is None or not np.isfinite(y).all() or len(y) < 4:
+    if y is None:
         return None
-    faces = att.find_faces(y)
+    y = y[np.isfinite(y).all(axis=1)]  # a recording may lack the accelerometer
+    faces = att.find_faces(y) if len(y) >= 4 else None
     if faces is None or not att.lies_on_faces(faces):
         return None
     k = np.argmax(np.abs(faces.up), axis=1)
@@ -286,4 +287,4 @@ def as_findings(carried: Sequence[Carried], issues: Sequence[Issue]) -> list[Fin
 
 def from_carried(carried: Carried, alone: bool) -> Finding:
     level = carried.level if carried.level != "fail" or alone else "warn"
-    return Finding("carries", level, carried.text, carried.kind, todo=carried.todo)  # type: ignore[arg-type]
+    return Finding("carries", level, carried.text, carried.kind, todo=carried.todo)

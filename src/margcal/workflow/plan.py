@@ -9,20 +9,18 @@ the error before and after it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from margcal.core import so3
 from margcal.core.errors import DataError, UsageError
 from margcal.core.types import Array, Calibration, Issue, Kind, Recording
-from margcal.core.units import KINDS, STANDARD_GRAVITY, UNITS
+from margcal.core.units import KINDS
 from margcal.methods.uncertainty import sphere
 from margcal.workflow.calibrate import calibrate
-from margcal.workflow.plan_information import Circumstances, Knowledge, Sensor, after_rest, beginning, gain_of
-
-Hands = Literal["box", "free"]
+from margcal.workflow.plan_information import Knowledge, after_rest, gain_of
+from margcal.workflow.plan_start import DIP, Hands, knowledge_of, nominal
 
 N_FIRST, N_MORE = 18, 6
 MOST = 96
@@ -30,15 +28,11 @@ SAME = np.radians(15.0)
 """Attitudes nearer than this are one."""
 DIRECTIONS, HEADINGS = 200, 4
 LEAST_TURN = np.radians(60.0)
-"""Smaller turns tell the gyroscope little; larger than `LARGEST_TURN` ones nobody makes in one go."""
-LARGEST_TURN = np.radians(181.0)
-S_ROT, LEVEL_SD = np.radians(0.2), np.radians(1.0)
-"""Housing error of a box put down by hand, and tilt of a table, where no recording tells them."""
-DIP = np.radians(60.0)
-NOISE: dict[Kind, float] = {"acc": 0.02 / 14, "gyr": 0.002 / 14, "mag": 0.009 / 14}
-"""Standard errors of the mean over two seconds at 100 Hz, of a consumer part: m/s^2, rad/s, share of the field."""
+"""Smaller turns tell the gyroscope little."""
 EXCHANGES = 60
-NOMINAL_SE = 1e-3
+HARDLY_WORSE, AXIS_SLACK = 0.05, 0.02
+"""Loss in the sum of squares for which an attitude is preferred that one turn about an axis of the box leads to, and
+the angle (rad) within which the axis is one of the box's."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +100,7 @@ def plan(
         If `n` or `sensors` is out of range.
     """
     _check(n, sensors)
-    start = _nominal(hands, sensors, dip)
+    start = nominal(hands, sensors, dip)
     now = after_rest(start, np.eye(3))
     first = Step(np.eye(3), None, now.errors_deg())
     candidates = attitudes(hands)
@@ -203,19 +197,29 @@ def _greedy(now: Knowledge, candidates: Array, n: int, seen: Sequence[Array]) ->
         open_ = _reachable(now.R, candidates)
         open_ = open_ & ~taken if (open_ & ~taken).any() else open_
         cost = np.where(open_, gain_of(now, candidates)[0], np.inf)
-        best = int(np.argmin(cost))
+        best = _simplest(now.R, candidates, cost)
         taken[best] = True
         chosen.append(candidates[best])
         now = after_rest(now, candidates[best])
     return np.array(chosen).reshape(-1, 3, 3)
 
 
+def _simplest(R: Array | None, candidates: Array, cost: Array) -> int:
+    """The best candidate, or one that is hardly worse and takes a single quarter or half turn to reach."""
+    if R is not None:
+        single = np.max(np.abs(so3.log(R.T @ candidates)), axis=1)
+        single = np.abs(single - so3.angle_between(R, candidates)) < AXIS_SLACK
+        easy = np.where(single, cost, np.inf)
+        if easy.min() <= (1 + HARDLY_WORSE) * cost.min():
+            return int(np.argmin(easy))
+    return int(np.argmin(cost))
+
+
 def _reachable(R: Array | None, candidates: Array) -> Array:
     """Which attitudes a turn worth making leads to."""
     if R is None:
         return np.ones(len(candidates), dtype=bool)
-    angle = so3.angle_between(R, candidates)
-    return (angle >= LEAST_TURN) & (angle <= LARGEST_TURN)
+    return so3.angle_between(R, candidates) >= LEAST_TURN
 
 
 def _exchanged(now: Knowledge, chosen: Array) -> Array:
@@ -254,7 +258,7 @@ class _Told:
     most: Mapping[Kind, float] = field(default_factory=dict)
 
     def errors(self, known: Knowledge) -> dict[Kind, float]:
-        errors = {k: v * self.scale.get(k, 1.0) for k, v in known.errors_deg().items()}
+        errors: dict[Kind, float] = {k: v * self.scale.get(k, 1.0) for k, v in known.errors_deg().items()}
         return {k: min(v, self.most.get(k, 180.0)) for k, v in errors.items()}
 
 
@@ -280,122 +284,3 @@ def _steps(now: Knowledge, chosen: Array, told: _Told) -> list[Step]:
         now = after_rest(now, R)
         steps.append(Step(R, turn, told.errors(now)))
     return steps
-
-
-# --- what is known -----------------------------------------------------------------------------------
-
-
-def _nominal(hands: Hands, sensors: Sequence[Kind], dip: float) -> Knowledge:
-    """A node of which only the kind is known, SI units."""
-    kinds = {k: _nominal_sensor(k, dip, hands == "free") for k in KINDS if k in sensors}
-    how = Circumstances(s_rot=S_ROT if hands == "box" else None)
-    return beginning(kinds, how)
-
-
-def _nominal_sensor(kind: Kind, dip: float, free: bool) -> Sensor:
-    u = {"acc": np.array([0.0, 0.0, STANDARD_GRAVITY]), "mag": np.array([0.0, np.cos(dip), -np.sin(dip)])}
-    sd = {"acc": 0.0 if free else float(LEVEL_SD), "mag": 1.0, "gyr": 0.0}[kind]
-    vector = u.get(kind, np.array([0.0, 0.0, 1.0]))
-    se = np.full(3, NOISE[kind])
-    return Sensor(kind, np.eye(3), np.zeros(3), vector, se, triangular=free and kind == "acc", u_sd=sd)
-
-
-def knowledge_of(
-    calibration: Calibration, recordings: Sequence[Recording], hands: Hands = "box", dip: float = DIP
-) -> Knowledge:
-    """What recordings told of a node, rest by rest.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        From `calibrate(*recordings, allow_fail=True)`.
-    recordings : sequence of Recording
-    """
-    free = calibration.frame == "acc-triangular" or (not calibration.models and hands == "free")
-    there = [k for k in KINDS if any(k in r.streams for r in recordings)]
-    sensors = {k: _sensor(calibration, recordings, k, dip, free) for k in there}
-    how = _circumstances(calibration, hands if not calibration.models else None)
-    now = beginning(sensors, how)
-    poses = calibration.poses
-    if poses is None or poses.R is None or not calibration.models:
-        return now
-    turned = {t.after for t in calibration.turns}
-    rests = [j for j in range(len(poses)) if np.isfinite(poses.R[j]).all()]
-    for j in rests:
-        read = [k for k in calibration.models if k in poses.mean and np.isfinite(poses.mean[k][j]).all()]
-        if j != rests[-1]:  # what is known from elsewhere is told once; but it tells how the node lies at last
-            read = [k for k in read if sensors[k].prior is None]
-        now = after_rest(now, poses.R[j], turned=j in turned and "gyr" in read, read=read)
-    return now
-
-
-def _sensor(
-    calibration: Calibration, recordings: Sequence[Recording], kind: Kind, dip: float, free: bool
-) -> Sensor:
-    model = calibration.models.get(kind)
-    nominal = _nominal_sensor(kind, dip, free)
-    if model is None:
-        return _unfitted(recordings, kind, nominal)
-    u = model.reference_vector
-    if kind == "gyr" or u is None or not np.isfinite(u).all():
-        size = STANDARD_GRAVITY if kind == "acc" else 1.0 if model.unit == "norm" else 50.0
-        u = nominal.u / np.linalg.norm(nominal.u) * size
-    elsewhere = model.method == "nominal-gain" or kind in calibration.settings.get("sources", {})
-    prior = _prior_of(model.covariance) if elsewhere else None
-    return replace(nominal, H=model.H, B=model.B, u=np.asarray(u), se=_standard_error(calibration, kind), prior=prior)
-
-
-def _prior_of(C: Array | None) -> Array | None:
-    """Covariance of a sensor that was not fitted at the rests with all others, as far as it is known."""
-    return None if C is None or not np.isfinite(C).all() else np.array(C)
-
-
-def _unfitted(recordings: Sequence[Recording], kind: Kind, nominal: Sensor) -> Sensor:
-    """A sensor that could not be calibrated: SI by its unit, else its counts as one magnitude."""
-    stream = next(r.streams[kind] for r in recordings if kind in r.streams)
-    factor = UNITS[kind][stream.unit]
-    if factor is None:  # its noise relative to its magnitude is what counts
-        return nominal
-    H = np.eye(3) * (factor / 50.0 if kind == "mag" else factor)
-    return replace(nominal, H=H, se=nominal.se / H[0, 0])
-
-
-def _standard_error(calibration: Calibration, kind: Kind) -> Array:
-    poses, model = calibration.poses, calibration.models[kind]
-    size = {"acc": STANDARD_GRAVITY, "gyr": 1.0, "mag": 50.0 if model.unit == "uT" else 1.0}[kind]
-    least = NOMINAL_SE * 0.05 * size / float(np.cbrt(abs(np.linalg.det(model.H))))
-    if poses is None or kind not in poses.sd or not len(poses):
-        return np.full(3, 20 * least)
-    variance = poses.sd[kind] ** 2 / np.maximum(poses.count[kind], 1)[:, None]
-    seen = np.isfinite(variance).all(axis=1)
-    if not seen.any():
-        return np.full(3, 20 * least)
-    return np.maximum(np.sqrt(variance[seen].mean(axis=0)), 0.01 * least)
-
-
-def _circumstances(calibration: Calibration, hands: Hands | None) -> Circumstances:
-    """Housing error, tilt and turns as the recordings had them."""
-    how = Circumstances(s_rot=S_ROT if hands == "box" else None)
-    mode = calibration.settings.get("attitudes")
-    if mode in ("cube", "file", "reference"):
-        rows = calibration.settings.get("checks", [])
-        found = [r["value"] for r in rows if r["code"] == "housing-error" and r["value"] is not None]
-        how = replace(how, s_rot=np.radians(max(found[0], 0.01)) if found else S_ROT)
-    elif mode == "faces":
-        how = replace(how, level_sd=_tilt(calibration))
-    gyr = calibration.fits.get("gyr")
-    if gyr is not None and len(calibration.turns) > 2:
-        residual = np.asarray(gyr.residual)
-        per_axis = float(np.sqrt(np.nanmean(residual**2) / 3)) if np.isfinite(residual).any() else how.turn_se
-        lasted = float(np.median([t.t[-1] - t.t[0] for t in calibration.turns if len(t.t) > 1] or [how.turn_s]))
-        how = replace(how, turn_se=max(per_axis, np.radians(0.003)), turn_s=lasted)
-    return how
-
-
-def _tilt(calibration: Calibration) -> float:
-    """How far "up" was from the faces, about each horizontal axis, rad."""
-    poses = calibration.poses
-    if poses is None or poses.R is None or len(poses) < 6:
-        return float(LEVEL_SD)
-    off = 1 - np.max(np.abs(poses.R[:, 2, :]), axis=1) ** 2  # sine of the tilt, squared
-    return float(max(np.sqrt(np.mean(off) / 2), np.radians(0.02)))

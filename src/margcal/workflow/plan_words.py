@@ -9,6 +9,10 @@ import numpy as np
 from margcal.core import so3
 from margcal.core.types import Array
 
+BY_EYE = np.radians(5.0)
+"""A turn by hand is no better than this: nearer ones are called by the same name."""
+
+
 def side(v: Array) -> str:
     """A direction in housing axes in words: ``+z``, ``+x -z edge``, ``+x +y -z corner``."""
     order = np.argsort(-np.abs(v))
@@ -28,14 +32,14 @@ def turn_words(turn: Array) -> str:
     if quarters is not None:
         return ", then ".join(quarters)
     axis = turn / angle
-    name = " ".join(f"{a:+.1f}" for a in axis)
+    name = " ".join(f"{a + 0.0:.1f}" for a in np.round(axis, 1))
     return f"{np.degrees(angle):.0f} degrees about ({name})"
 
 
 def _by_quarters(R: Array) -> list[str] | None:
     """One or two quarter or half turns about the housing's own axes that make `R`, the fewest first."""
     for words, made in _by_hand():
-        if np.allclose(made, R, atol=1e-6):
+        if so3.angle_between(made, R) < BY_EYE:
             return words
     return None
 

@@ -73,18 +73,21 @@ def robust_joint(triads: Mapping[Kind, Triad], gyro: Gyro | None, R: Array, prio
 
 def _taken_in_again(first: RobustFit, last: RobustFit) -> RobustFit:
     """`last` with what agrees with it after all: of a wrong label, a good reading may have gone out before it did."""
-    kept = []
+    now = last
     for out in last.left_out:
-        chi2, misfit = predicted_misfit(last.fit, first.triads, first.gyro, first.priors, out.what, out.index)
-        if chi2 >= out.limit and misfit >= MATTERS[out.what]:
-            kept.append(replace(out, chi2=chi2, misfit=misfit))
-    if len(kept) == len(last.left_out):
-        return replace(last, left_out=tuple(kept))
-    now = first
-    for out in kept:
-        now = _without(now, out.what, out.index)
-    fit = joint_fit(now.triads, now.gyro, last.fit.R, now.priors, components=last.fit.component)
-    return replace(now, fit=fit, left_out=tuple(kept))
+        others = tuple(o for o in now.left_out if o is not out)
+        with_it = replace(first, left_out=others)
+        for other in others:
+            with_it = _without(with_it, other.what, other.index)
+        # the attitude of that rest may hang on these rows alone: how they fit is seen with them in
+        components = now.fit.component
+        trial = joint_fit(with_it.triads, with_it.gyro, now.fit.R, with_it.priors, components=components)
+        same = joint_fit(
+            with_it.triads, with_it.gyro, trial.R, with_it.priors, components=components, estimate_components=False
+        )
+        if trial.converged and same.cost - now.fit.cost < min(out.limit, LOOK_AT):
+            now = replace(with_it, fit=trial)
+    return now
 
 
 def _suspect(fit: JointFit) -> tuple[str, int] | None:

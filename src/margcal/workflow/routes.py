@@ -418,6 +418,7 @@ def _jointly(
         for out in robust.left_out:
             solved.left_out.setdefault(out.what, set()).add(out.index)
         adopt(solved, robust.fit)
+        solved.R = np.where(known_R[:, None, None], robust.fit.R, np.nan)
         solved.issues += issues_of(robust, cube=job.attitudes.mode in ("cube", "file"))
         return
     text = (

@@ -17,6 +17,7 @@ import numpy as np
 from margcal.core import so3
 from margcal.core.errors import UsageError
 from margcal.core.types import Array, Issue, Kind, Poses, Recording, Stream, Turn
+from margcal.core.units import KINDS
 
 MIN_REST_S = 1.0
 """Shortest rest, s."""
@@ -376,7 +377,7 @@ def _pool(tables: Sequence[Poses]) -> Poses:
     """One table of the rests of all recordings; NaN where a recording lacks a sensor."""
     if len(tables) == 1:
         return tables[0]
-    kinds: list[Kind] = [k for k in ("acc", "gyr", "mag") if any(k in p.mean for p in tables)]  # type: ignore[misc]
+    kinds: list[Kind] = [k for k in KINDS if any(k in p.mean for p in tables)]
 
     def stack(name: str, kind: Kind, shape: tuple[int, ...], fill: float) -> Array:
         parts = [getattr(p, name).get(kind, np.full((len(p), *shape), fill)) for p in tables]
