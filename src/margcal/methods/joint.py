@@ -554,7 +554,8 @@ def _result(
         covariance["gyr"] = _model_covariance(layout, inverse, "gyr", H["gyr"])
         dR = integrate(gyro.turns.y, gyro.turns.dt, H["gyr"], state.B["gyr"])
         net = np.swapaxes(state.R[gyro.before], -1, -2) @ state.R[gyro.after]
-        residual["gyr"] = so3.angle_between(dR, net)
+        counted = np.ones(len(net)) if gyro.weight is None else gyro.weight
+        residual["gyr"] = np.where(counted > 0, so3.angle_between(dR, net), np.nan)
     redundancy = {b.name: _redundancy(b, inverse, parts) for b in blocks}
     return JointFit(
         H=H,

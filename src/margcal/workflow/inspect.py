@@ -52,7 +52,7 @@ class Inspection:
     @property
     def conclusion(self) -> str:
         """All of it in one line."""
-        carries = {f.sensor: f.level for f in self.findings if f.check == "carries"}
+        carries: dict[Kind | None, str] = {f.sensor: f.level for f in self.findings if f.check == "carries"}
         whole: dict[Kind, str] = {c.kind: c.level for c in self.carried}
         parts: dict[str, list[str]] = {"pass": [], "warn": [], "fail": []}
         for kind in carries:

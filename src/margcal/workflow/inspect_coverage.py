@@ -13,6 +13,8 @@ from margcal.core.types import Array, Issue, Kind, Recording, Turn
 from margcal.core.units import UNITS
 from margcal.methods.coverage import NINE, SIX, distinct_directions
 from margcal.methods.preintegration import integrate, pad
+from margcal.methods.triangular import triangular
+from margcal.methods.uncertainty import expected_error
 from margcal.workflow import attitudes as att
 from margcal.workflow.attitudes import Attitudes
 from margcal.workflow.decide import decide
@@ -20,6 +22,7 @@ from margcal.workflow.findings import Finding, Grade, graded
 from margcal.workflow.inspect_axes import gyr_bias
 from margcal.workflow.job import NAMES, Job, Options
 from margcal.workflow.lint_units import sphere_of
+from margcal.workflow.routes import GOOD_ENOUGH_DEG
 from margcal.workflow.segment import Segmentation
 from margcal.workflow.swing import MIN_SWING_SAMPLES
 from margcal.workflow.turns import MIN_TURNS, usable_turns
@@ -239,12 +242,27 @@ def _acc_carried(job: Job, found: Directions, faces: set[str] | None) -> Carried
         missing = ", ".join(f for f in FACE_NAMES if f not in faces)
         level = "warn" if len(faces) >= 4 else "fail"
         return Carried("acc", level, f"not all of it: {missing} never was up", f"put it down with {missing} up")
-    if _known(job) or found.rest >= NINE:
+    if _known(job) or (found.rest >= NINE and _nine_parameters(job) <= GOOD_ENOUGH_DEG):
         return Carried("acc", "pass", "can be calibrated")
+    if found.rest >= NINE:
+        text = f"hardly: its {found.rest} directions lie so that nine parameters come out uncertain"
+        return Carried("acc", "warn", text, more)
     if found.rest >= SIX:
         text = f"bias and scale factors only: {found.rest} directions, nine parameters need {NINE}"
         return Carried("acc", "warn", text, more)
     return Carried("acc", "fail", f"cannot be calibrated: {found.rest} directions at rest, {SIX} are the least", more)
+
+
+def _nine_parameters(job: Job) -> float:
+    """Expected error (deg) of bias, scale factors and angles from lengths alone: what `calibrate` goes by."""
+    y, _ = job.readings("acc")
+    try:
+        fit = triangular(y, job.options.gravity)
+    except DataError:
+        return float("inf")
+    if fit.covariance is None or not np.isfinite(fit.covariance).all():
+        return float("inf")
+    return expected_error("acc", fit.model.H, fit.covariance, job.options.gravity).direction_deg
 
 
 def _gyr_carried(job: Job, spread: float | None) -> Carried:

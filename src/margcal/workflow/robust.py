@@ -80,13 +80,10 @@ def _taken_in_again(first: RobustFit, last: RobustFit) -> RobustFit:
         for other in others:
             with_it = _without(with_it, other.what, other.index)
         # the attitude of that rest may hang on these rows alone: how they fit is seen with them in
-        components = now.fit.component
-        trial = joint_fit(with_it.triads, with_it.gyro, now.fit.R, with_it.priors, components=components)
-        same = joint_fit(
-            with_it.triads, with_it.gyro, trial.R, with_it.priors, components=components, estimate_components=False
-        )
-        if trial.converged and same.cost - now.fit.cost < min(out.limit, LOOK_AT):
-            now = replace(with_it, fit=trial)
+        rows = with_it.triads, with_it.gyro, now.fit.R, with_it.priors
+        fit = joint_fit(*rows, components=now.fit.component, estimate_components=False)
+        if fit.converged and fit.cost - now.fit.cost < LOOK_AT:
+            now = replace(with_it, fit=joint_fit(*rows, components=now.fit.component))
     return now
 
 
