@@ -69,12 +69,12 @@ def test_relate_finds_any_matrix_mirrored_ones_too(seed):
     assert found.explained > 0.999
 
 
-def test_relate_standard_error_is_that_of_repetitions():
+def test_relate_standard_error_is_on_the_safe_side():
     t, v, t_gyr, z = motion(0.0, np.eye(3), 0.0)
     rng = np.random.default_rng(5)
     found = [relate(t, v + 0.03 * rng.normal(size=v.shape), t_gyr, z) for _ in range(25)]
     spread = np.std([f.delay_s for f in found])
-    assert 0.6 < np.sqrt(np.mean([f.delay_se_s**2 for f in found])) / spread < 1.7
+    assert 0.9 < np.sqrt(np.mean([f.delay_se_s**2 for f in found])) / spread < 3
 
 
 def test_relate_refuses_what_has_no_time_in_common():
@@ -151,9 +151,9 @@ def test_still_sensors_prove_nothing():
     t = np.arange(n) / 100
     still = Recording.from_arrays(
         t,
-        acc=rng.normal(0, 0.02, (n, 3)) + [0, 0, 9.8],
+        acc=rng.normal([0, 0, 9.8], 0.02, (n, 3)),
         gyr=rng.normal(0, 0.01, (n, 3)),
-        mag=rng.normal(0, 0.3, (n, 3)) + [20, 0, -40],
+        mag=rng.normal([20, 0, -40], 0.3, (n, 3)),
         units={"acc": "mps2", "gyr": "radps", "mag": "uT"},
     )
     found = inspect(still)
@@ -288,3 +288,10 @@ def test_sunsided_has_a_gyroscope_that_is_the_odd_one(data_file):
         axes = one(found, "axes", kind)
         assert axes.level == "warn" and "x is -x, y is -y of the gyroscope" in axes.text
         assert "left-handed" in axes.text and "the gyroscope is the odd one" in axes.todo
+
+
+def test_an_attached_magnet_makes_the_field_doubtful(data_file):
+    found = inspect(read(data_file("broad/33_disturbed_attached_magnet_2cm.parquet")))
+    mag = next(c for c in found.carried if c.kind == "mag")
+    assert mag.level == "warn" and "off a sphere" in mag.text
+    assert any("magnets and iron" in step for step in found.next_steps)

@@ -178,6 +178,19 @@ def test_refuses_what_cannot_be_determined():
         gls_ml(y[0], R[:7], G)
 
 
+def test_a_node_that_cannot_be_solved_spoils_no_other():
+    rng = np.random.default_rng(4)
+    R = np.stack([random_poses(12, rng), so3.exp(np.linspace(0, 6, 12)[:, None] * [0, 0, 1.0])])
+    y = (R @ U) @ A.T + B + NOISE * rng.normal(size=(2, 12, 3))
+    both, one = gls_ml(y, R, G, noise_sd=NOISE), gls_ml(y[0], R[0], G, noise_sd=NOISE)
+    assert both.details["converged"].tolist() == [True, False]
+    assert "1 of 2" in both.text
+    assert np.allclose(both.model.H[0], one.model.H, rtol=1e-8)
+    assert np.isnan(both.model.H[1]).all()
+    found = robust_gls(y, R, G, noise_sd=NOISE)
+    assert not found.left_out.any()
+
+
 # --- statistics --------------------------------------------------------------------------------------
 
 

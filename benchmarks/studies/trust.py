@@ -86,13 +86,13 @@ def main() -> None:
     options = parser.parse_args()
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / "trust.json"
-    kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     for name in options.only or STUDIES:
         title, bar, study = STUDIES[name]
         begin = time.process_time()
         rows = study(options.runs)
         spent = time.process_time() - begin
         print(f"\n{name}: {title}\nbar: {bar}\n{table(rows)}\n({options.runs} runs, {spent:.0f} s)", flush=True)
+        kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         kept[name] = {"runs": options.runs, "bar": bar, "numpy": np.__version__, "python": platform.python_version()}
         kept[name] |= {"rows": rows}
         path.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")

@@ -32,6 +32,9 @@ WORST_CONDITION = 20.0
 LARGEST = 1e60
 """No sensor's H, its inverse, or the vector that it senses is larger in any unit; beyond, squares overflow."""
 
+_TRANSFORMS = ("offset_s", "drift_ppm", "marker_to_node", "lab_to_earth", "lever_arm_m")
+_ALIGNMENT = (*_TRANSFORMS, *(f"{name}_se" for name in _TRANSFORMS))
+
 
 @cache
 def structs() -> Any:
@@ -410,7 +413,9 @@ def _document(calibration: Calibration) -> dict[str, Any]:
 def _alignment(alignment: Alignment | None) -> dict[str, Any] | None:
     if alignment is None:
         return None
-    return {"common_clock": alignment.common_clock, **alignment.values}
+    values = dict(alignment.values)
+    known = {name: values.pop(name) for name in _ALIGNMENT if name in values}  # one order, whatever the caller's
+    return {"common_clock": alignment.common_clock, **known, **values}
 
 
 def _json(value: Any, depth: int) -> str:

@@ -276,7 +276,8 @@ def _linearise(p: _Problem, state: _State) -> _Linear:
     # inverse3 divides by the determinant, so |S| is safely positive here
     log_S = np.einsum("nj,nj->n", np.log(determinant3(S)), p.weight)
     square = np.einsum("nja,njab,njb,nj->n", r, S_inverse, r, p.weight, optimize=True)
-    log_likelihood = -0.5 * (log_S + np.linalg.slogdet(N)[1] + square)
+    with np.errstate(invalid="ignore"):  # NaN for nodes that `one_step` could not solve
+        log_likelihood = -0.5 * (log_S + np.linalg.slogdet(N)[1] + square)
     return _Linear(r, X, S, S_inverse, back, inverse, (inverse @ g)[..., 0], V_rot, log_likelihood)
 
 
@@ -370,7 +371,8 @@ def _to_fit(found: _Found, y: Array, kind: Kind, raw_unit: str, unit: str, lead:
     rms = None if lead else float(np.sqrt(np.mean(residual[weight > 0] ** 2)))
     H, B, u, residual, covariance = (np.reshape(a, (*lead, *a.shape[1:])) for a in (H, B, u, residual, covariance))
     model = SensorModel(kind, H, B, raw_unit, unit, None if lead else covariance, rms, y.shape[-2], "gls-ml")
-    condition = np.linalg.cond(H)
+    solved = np.isfinite(H).all(axis=(-1, -2), keepdims=True)
+    condition = np.where(solved[..., 0, 0], np.linalg.cond(np.where(solved, H, np.eye(3))), np.nan)
     bad = int((~state.converged).sum())
     return Fit(
         model,

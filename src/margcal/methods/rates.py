@@ -57,7 +57,9 @@ class RateRelation:
     explained : float
         Share of the squared changes of v that (i) accounts for.
     delay_s, delay_se_s : float
-        Delay of the sensor behind the gyroscope, and its standard error by leaving parts out.
+        Delay of the sensor behind the gyroscope, and its standard error by leaving parts out: on the safe side by a
+        factor of two where the sensor's noise is white (neighbouring windows share a reading, whose noise cancels
+        but where a part was cut out).
     """
 
     G: Array

@@ -99,7 +99,9 @@ class Knowledge:
 
     def errors_deg(self) -> dict[Kind, float]:
         """Expected direction error of each sensor."""
-        return {k: float(np.degrees(np.sqrt(v))) for k, v in _variances(self.sensors, self.P).items()}
+        at, _ = _layout(self.sensors)
+        weights = _weights(self.sensors).items()
+        return {k: float(np.degrees(np.sqrt(max(np.sum(W * self.P[at[k], at[k]]), 0.0)))) for k, W in weights}
 
 
 def beginning(sensors: Mapping[Kind, Sensor], how: Circumstances) -> Knowledge:
@@ -125,14 +127,20 @@ def after_rest(now: Knowledge, R: Array, *, turned: bool = True, read: Sequence[
     read : sequence of kind, optional
         Sensors that were read at it; default all that have no `prior` from elsewhere or will be read anew.
     """
-    P = _updated(now, R[None], turned, tuple(now.sensors) if read is None else tuple(read))[0]
+    P = _updated(now, R, turned, tuple(now.sensors) if read is None else tuple(read))
     return replace(now, P=P, R=R)
 
 
 def gain_of(now: Knowledge, candidates: Array) -> tuple[Array, dict[Kind, Array]]:
     """Expected direction variance (C,), summed over the sensors, after each candidate (C, 3, 3); and each sensor's."""
-    P = _updated(now, candidates, now.R is not None, tuple(now.sensors))
-    each = _variances(now.sensors, P)
+    big, PJ, S = _step(now, candidates, now.R is not None, tuple(now.sensors))
+    solved = np.linalg.solve(S, np.swapaxes(PJ, 1, 2))
+    at, _ = _layout(now.sensors)
+    each: dict[Kind, Array] = {}
+    for kind, W in _weights(now.sensors).items():
+        where = at[kind]
+        lost = np.sum((W @ PJ[:, where]) * np.swapaxes(solved[:, :, where], 1, 2), axis=(1, 2))
+        each[kind] = np.maximum(np.sum(W * big[where, where]) - lost, 0.0)
     return np.sum(list(each.values()), axis=0), each
 
 
@@ -177,7 +185,17 @@ def _tangent(u: Array) -> Array:
 
 
 def _updated(now: Knowledge, R: Array, turned: bool, read: tuple[Kind, ...]) -> Array:
-    """P (C, n, n) after a rest at each of R (C, 3, 3)."""
+    """P (n, n) after a rest at R (3, 3); the attitude of the rest before it is let go."""
+    big, PJ, S = _step(now, R[None], turned, read)
+    P = big - PJ[0] @ np.linalg.solve(S[0], PJ[0].T)
+    n = len(now.P)
+    keep = np.r_[0 : n - 3, n : n + 3]
+    P = P[np.ix_(keep, keep)]
+    return (P + P.T) / 2
+
+
+def _step(now: Knowledge, R: Array, turned: bool, read: tuple[Kind, ...]) -> tuple[Array, Array, Array]:
+    """P with the attitude of one more rest (n+3, n+3), and for each of R (C, 3, 3) P J^T and J P J^T + 1."""
     at, n = _layout(now.sensors)
     new = slice(n, n + 3)
     big = np.zeros((n + 3, n + 3))
@@ -187,13 +205,12 @@ def _updated(now: Knowledge, R: Array, turned: bool, read: tuple[Kind, ...]) -> 
     if turned and now.R is not None and "gyr" in now.sensors:
         rows.append(_turn_rows(now, at, new, n + 3, R))
     rows += _attitude_rows(now.how, new, n + 3, R)
+    if not rows:
+        return big, np.zeros((len(R), n + 3, 0)), np.zeros((len(R), 0, 0))
     J = np.concatenate(rows, axis=1)
-    PJ = np.einsum("ij,ckj->cik", big, J)
-    S = J @ PJ + np.eye(J.shape[1])
-    P = big - PJ @ np.linalg.solve(S, np.swapaxes(PJ, 1, 2))
-    keep = np.r_[0 : n - 3, n : n + 3]
-    P = P[:, keep[:, None], keep]
-    return (P + np.swapaxes(P, 1, 2)) / 2
+    m = J.shape[1]
+    PJ = np.swapaxes((J.reshape(-1, n + 3) @ big).reshape(-1, m, n + 3), 1, 2)
+    return big, PJ, J @ PJ + np.eye(m)
 
 
 def _reading_rows(sensor: Sensor, at: Mapping[str, slice], new: slice, size: int, R: Array) -> Array:
@@ -261,9 +278,8 @@ def direction_weight(kind: Kind, H: Array, magnitude: float) -> Array:
     return np.einsum("nia,nij,njb->ab", L, across, L) / len(u) / magnitude**2
 
 
-def _variances(sensors: Mapping[Kind, Sensor], P: Array) -> dict[Kind, Array]:
-    """Mean square direction error, rad^2, of each sensor; `P` (..., n, n)."""
-    at, _ = _layout(sensors)
+def _weights(sensors: Mapping[Kind, Sensor]) -> dict[Kind, Array]:
+    """`direction_weight` of each sensor for its part of the state: (A, B), for a gyroscope (H, B)."""
     out: dict[Kind, Array] = {}
     for kind, sensor in sensors.items():
         W = direction_weight(kind, sensor.H, sensor.magnitude)
@@ -271,5 +287,5 @@ def _variances(sensors: Mapping[Kind, Sensor], P: Array) -> dict[Kind, Array]:
             to = np.eye(12)
             to[:9, :9] = -np.kron(sensor.H, sensor.H.T)
             W = to.T @ W @ to
-        out[kind] = np.maximum(np.einsum("ab,...ba->...", W, P[..., at[kind], at[kind]]), 0.0)
+        out[kind] = (W + W.T) / 2
     return out
