@@ -120,6 +120,11 @@ def _mended(path: str | os.PathLike[str]) -> Iterator[None]:
         shown = printable(os.fspath(path))
         if error.errno in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error):
             raise InputError(f"{shown}: the disk is full; free some space or choose another place") from error
+        if error.errno == errno.EFBIG:
+            raise InputError(
+                f"{shown}: cannot be written: larger than a file may be on this disk; choose another place, or a "
+                "smaller format (.parquet)"
+            ) from error
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.EIO):
             raise InputError(f"{shown}: cannot be written ({error.strerror})") from error
         raise

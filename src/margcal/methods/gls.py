@@ -371,8 +371,8 @@ def _to_fit(found: _Found, y: Array, kind: Kind, raw_unit: str, unit: str, lead:
     rms = None if lead else float(np.sqrt(np.mean(residual[weight > 0] ** 2)))
     H, B, u, residual, covariance = (np.reshape(a, (*lead, *a.shape[1:])) for a in (H, B, u, residual, covariance))
     model = SensorModel(kind, H, B, raw_unit, unit, None if lead else covariance, rms, y.shape[-2], "gls-ml")
-    solved = np.isfinite(H).all(axis=(-1, -2), keepdims=True)
-    condition = np.where(solved[..., 0, 0], np.linalg.cond(np.where(solved, H, np.eye(3))), np.nan)
+    solved = np.asarray(np.isfinite(determinant3(H)))
+    condition = np.where(solved, np.linalg.cond(np.where(solved[..., None, None], H, np.eye(3))), np.nan)
     bad = int((~state.converged).sum())
     return Fit(
         model,
