@@ -287,7 +287,7 @@ def test_numbers_that_do_not_match_are_refused():
         gyro.gauss_newton(world.turns, world.dR[:3], H0=np.eye(3))
     with pytest.raises(InputError, match="positive definite"):
         gyro.gauss_newton(world.turns, world.dR, H0=np.eye(3), bias_prior=(np.zeros(3), np.zeros((3, 3))))
-    with pytest.raises(InputError, match="no start"):
+    with pytest.raises(DataError, match="no start"):
         gyro.propagate_gravity(world.turns, world.up_before, world.up_after)
 
 
