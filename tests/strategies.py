@@ -141,7 +141,7 @@ def sessions(draw: st.DrawFn, *, noise: bool = True, least: int = 16, most: int 
     u = draw(st.sampled_from([1.0, 9.80665, 50.0])) * draw(directions())
     extent = np.linalg.norm(u) * np.linalg.norm(np.linalg.inv(H), 2)
     B = extent * draw(st.floats(0, 30)) * rng.uniform(-1, 1, 3)
-    sigma = 2e-3 * extent if noise else 0.0
+    sigma = float(2e-3 * extent) if noise else 0.0
     y = (R @ u) @ np.linalg.inv(H).T + B + sigma * rng.normal(size=(len(R), 3))
     return Session(H, B, u, R, y, sigma)
 
@@ -157,8 +157,8 @@ _json = st.recursive(
 )
 
 
-def _vectors(n: int) -> st.SearchStrategy[tuple[float, ...]]:
-    return st.tuples(*[st.floats(-1e50, 1e50)] * n)
+def _vectors(n: int) -> st.SearchStrategy[Array]:
+    return st.tuples(*[st.floats(-1e50, 1e50)] * n).map(np.array)
 
 
 def covariances() -> st.SearchStrategy[Array]:
@@ -178,7 +178,7 @@ def models(draw: st.DrawFn, kind: Kind) -> SensorModel:
     return SensorModel(
         kind,
         draw(transformations()) * 10.0 ** draw(st.integers(-40, 40)),
-        draw(st.tuples(finite, finite, finite)),
+        np.array(draw(st.tuples(finite, finite, finite))),
         raw_unit,
         draw(st.sampled_from(["uT", "norm"])) if kind == "mag" else SI_UNIT[kind],
         covariance=draw(st.none() | covariances()),
@@ -219,7 +219,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
         **found,
         device=draw(st.none() | _words),
         frame=draw(st.text(min_size=1, max_size=20)),
-        verdict=draw(st.none() | st.sampled_from(["pass", "warn", "fail"])),
+        verdict=draw(st.sampled_from([None, "pass", "warn", "fail"])),
         issues=tuple(draw(st.lists(issue, max_size=3))),
         alignment=draw(st.none() | alignment),
         created=draw(st.text(min_size=1, max_size=20)),

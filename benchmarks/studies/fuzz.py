@@ -104,11 +104,12 @@ def _apply(path: Path, number: int) -> None:
     from margcal.workflow.apply import apply_file
 
     H = 0.01 * np.eye(3)
-    models = {"acc": SensorModel("acc", H, np.ones(3)), "mag": SensorModel("mag", H, np.ones(3), "uT", delay_s=0.004)}
+    mag = SensorModel("mag", H, np.ones(3), "uT", delay_s=0.004)
+    calibration = Calibration(SensorModel("acc", H, np.ones(3)), mag=mag)
     before = set(os.listdir(path.parent))
     target = path.with_name("out.csv" if number % 2 else "out.parquet")
     try:
-        apply_file(Calibration(**models), path, target, overwrite=True)
+        apply_file(calibration, path, target, overwrite=True)
     except MargcalError:
         _must(not set(os.listdir(path.parent)) - before, "files left behind")
         raise

@@ -166,7 +166,7 @@ _HEAD = (
 
 def _recording_rows(wide: bool) -> tuple[tuple[str, ...], ...]:
     rng = np.random.default_rng(1)
-    rows = [_HEAD if wide else _HEAD[:4]]
+    rows: list[tuple[str, ...]] = [_HEAD if wide else _HEAD[:4]]
     for k in range(24):
         q = rng.normal(size=4)
         numbers = [k / 100, *rng.normal(size=9) * 100, 21.5, *q / np.linalg.norm(q), *rng.normal(size=3) * 1e3]
@@ -195,7 +195,7 @@ def _recordings() -> tuple[Text, ...]:
 @cache
 def _poses() -> tuple[Text, ...]:
     rng = np.random.default_rng(2)
-    quaternions = [("qw", "qx", "qy", "qz", "start_s", "stop_s", "file")]
+    quaternions: list[tuple[str, ...]] = [("qw", "qx", "qy", "qz", "start_s", "stop_s", "file")]
     faces = [("up", "front", "note")]
     for k in range(12):
         q = rng.normal(size=4)
