@@ -42,7 +42,7 @@ class Alignment:
     gain: float = 1.0
 
 
-def rotation_from_dip(v: Array, up: Array) -> Array | None:
+def rotation_from_dip(v: Array, up: Array, least: float = 1e-2) -> Array | None:
     """Omega from the constant angle between field and vertical.
 
     Parameters
@@ -51,6 +51,8 @@ def rotation_from_dip(v: Array, up: Array) -> Array | None:
         Unit vectors, magnetometer calibrated by magnitude.
     up : ndarray (J, 3)
         Unit vectors to the zenith in the node frame, in the same attitudes.
+    least : float
+        Second-smallest singular value relative to the largest, below which the attitudes do not determine it.
 
     Returns
     -------
@@ -62,7 +64,7 @@ def rotation_from_dip(v: Array, up: Array) -> Array | None:
     if len(rows) < 10:
         return None
     _, singular, Vt = np.linalg.svd(rows)
-    if singular[8] < 1e-2 * singular[0]:
+    if singular[8] < least * singular[0]:
         return None
     X = Vt[-1][:9].reshape(3, 3)
     return so3.nearest_rotation(X if np.linalg.det(X) > 0 else -X)

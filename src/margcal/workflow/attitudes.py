@@ -16,6 +16,7 @@ import numpy as np
 from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Index, Issue
+from margcal.methods.alignment import rotation_from_dip
 from margcal.methods.ellipsoid import ellipsoid
 from margcal.workflow.segment import Segmentation
 
@@ -256,13 +257,10 @@ def headings_from_field(m: Array, up: Array) -> FieldHeadings | None:
     except DataError:
         return None
     v = _unit(fit.model.apply(m))
-    rows = np.column_stack([(up[:, :, None] * v[:, None, :]).reshape(len(v), 9), -np.ones(len(v))])
-    singular, Vt = np.linalg.svd(rows)[1:]
-    if len(singular) < 10 or singular[8] < 1e-3 * singular[0]:
+    Omega = rotation_from_dip(v, up, least=1e-3)  # ninety degrees are told with less than a mounting needs
+    if Omega is None:
         return None
-    X = Vt[-1][:9].reshape(3, 3)
-    X = X if np.linalg.det(X) > 0 else -X
-    w = v @ so3.nearest_rotation(X).T
+    w = v @ Omega.T
     choices = np.array([_heading_choices(c) for c in up])  # (J, 4, 3, 3)
     level = np.einsum("jab,jb->ja", choices[:, 0], w)
     alpha = np.arctan2(level[:, 1], level[:, 0])

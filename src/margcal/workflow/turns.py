@@ -15,7 +15,7 @@ from margcal.methods.gyro_start import full_turns
 from margcal.methods.preintegration import along
 from margcal.methods.uncertainty import expected_error
 from margcal.workflow.job import Job, Solved
-from margcal.workflow.lint import clipped
+from margcal.workflow.lint import clip_limits, clipped
 
 FULL_TURN_DEG = (345.0, 375.0)
 MIN_TURNS = 5
@@ -31,13 +31,15 @@ MAX_FREE_ERROR_DEG = 1.0
 
 def usable_turns(job: Job, usable: Mask | None = None) -> list[Turn]:
     """Turns between usable rests whose readings are all there and none at the end of the scale."""
+    limits = [None if r.gyr is None else clip_limits(r.gyr) for r in job.recordings]
     turns = []
     for turn in job.segmentation.turns:
         if usable is not None and not (usable[turn.before] and usable[turn.after]):
             continue
-        stream = job.recordings[job.segmentation.poses.recording[turn.before]].gyr
+        index = job.segmentation.poses.recording[turn.before]
+        stream = job.recordings[index].gyr
         assert stream is not None
-        if not clipped(turn.y, stream).any():
+        if not clipped(turn.y, stream, limits[index]).any():
             turns.append(turn)
     return turns
 
