@@ -410,12 +410,25 @@ class Turn:
 
 @dataclass(frozen=True)
 class Attitude:
-    """A track of attitudes: `t` (N,) s and `R`, which takes components of frame `child` to frame `parent`."""
+    """A track of attitudes: `t` (N,) s and `q` (N, 4), scalar first, which takes frame `child` to frame `parent`."""
 
     t: Array
-    R: Rotation
+    q: Array
     parent: str = "earth"
     child: str = "node"
+
+    def __post_init__(self) -> None:
+        _set(self, "t", _frozen(self.t, (None,), "attitude time"))
+        _set(self, "q", _frozen(self.q, (None, 4), "attitude quaternions"))
+        if len(self.t) != len(self.q):
+            raise InputError(f"{len(self.t)} times for {len(self.q)} attitudes")
+
+    @property
+    def R(self) -> Rotation:
+        """The attitudes as scipy `Rotation`: ``v_parent = R.apply(v_child)``."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(np.roll(self.q, -1, axis=1))
 
 
 @dataclass(frozen=True)
