@@ -51,9 +51,12 @@ if TYPE_CHECKING:
     from margcal.methods.gyro_paper import ukf
     from margcal.methods.one_step import one_step
     from margcal.methods.triangular import triangular
+    from margcal.workflow.align import align
     from margcal.workflow.calibrate import calibrate
+    from margcal.workflow.evaluate import evaluate
     from margcal.workflow.segment import find_poses
     from margcal.workflow.simulate import simulate
+    from margcal.workflow.verify import verify
 
     __version__: str
 
@@ -62,6 +65,7 @@ __all__ = [
     "Recording",
     "find_poses",
     "calibrate",
+    "align",
     "Calibration",
     "load",
     "save",
@@ -74,6 +78,8 @@ __all__ = [
     "triangular",
     "gauss_newton",
     "ukf",
+    "evaluate",
+    "verify",
     "simulate",
     "MargcalError",
     "InputError",
@@ -87,6 +93,7 @@ _HOME = {
     "Recording": "core.types",
     "find_poses": "workflow.segment",
     "calibrate": "workflow.calibrate",
+    "align": "workflow.align",
     "Calibration": "core.types",
     "load": "files.calfile",
     "save": "files.calfile",
@@ -99,6 +106,8 @@ _HOME = {
     "triangular": "methods.triangular",
     "gauss_newton": "methods.gyro",
     "ukf": "methods.gyro_paper",
+    "evaluate": "workflow.evaluate",
+    "verify": "workflow.verify",
     "simulate": "workflow.simulate",
     "MargcalError": "core.errors",
     "InputError": "core.errors",

@@ -34,6 +34,19 @@ def _units(_context: click.Context, _parameter: click.Parameter, text: str | Non
     return units
 
 
+def _numbers(context: click.Context, parameter: click.Parameter, text: str | None) -> dict[str, float] | None:
+    """``acc=0.0048,gyr=0.001`` as a dict of positive numbers."""
+    numbers: dict[str, float] = {}
+    for kind, value in (_units(context, parameter, text) or {}).items():
+        try:
+            numbers[kind] = float(value)
+        except ValueError:
+            numbers[kind] = 0.0
+        if not 0 < numbers[kind] < float("inf"):
+            raise click.BadParameter(f"{value!r} is no scale; expected such as acc=0.00479")
+    return numbers or None
+
+
 def _together(*options: Callable[[Verb], Verb]) -> Callable[[Verb], Verb]:
     def decorate(verb: Verb) -> Verb:
         for option in reversed(options):
@@ -85,7 +98,9 @@ def _print_version(context: click.Context, _parameter: click.Parameter, wanted: 
     if wanted and not context.resilient_parsing:
         from importlib.metadata import version
 
-        click.echo(f"margcal {version('margcal')}")
+        from margcal.core import compiled
+
+        click.echo(f"margcal {version('margcal')}\ncompiled kernels: {compiled.state()}")
         context.exit()
 
 
@@ -203,6 +218,53 @@ def calibrate(recordings: tuple[str, ...], level_sd: float, **given: Any) -> int
 
 
 @cli.command()
+@click.argument("recording", metavar="RECORDING")
+@click.option(
+    "--reference", required=True, metavar="REF", help="Attitudes from motion capture; may be RECORDING itself."
+)
+@click.option("--static", metavar="STATIC", help="A recording of the node at rest, for the gyroscope's bias.")
+@click.option("--common-clock", is_flag=True, help="REF is on the node's clock (always so if it is RECORDING).")
+@click.option("--markers", metavar="NAME,...", help="Markers of the body, where REF holds marker tracks (C3D, table).")
+@click.option(
+    "--method",
+    type=click.Choice(["r-bsn", "lowpass-svd", "forward"]),
+    help="The paper's; without positions; with positions.  [default: by what REF holds]",
+)
+@click.option("--as-printed", is_flag=True, help="R-BSN (14) as printed, to see what it gives.")
+@click.option(
+    "--norm",
+    type=click.Choice(["l1", "lengths"]),
+    default="l1",
+    show_default=True,
+    help="Of R-BSN (20): entrywise, or the sum of lengths.",
+)
+@_sensors
+@click.option("--gravity", type=float, metavar="G", help="Local gravity, m/s^2.  [default: 9.80665]")
+@click.option("--field", type=float, metavar="uT", help="Strength of the magnetic field.  [default: the unit]")
+@_at
+@click.option("--device", metavar="NAME", help="Name of the node, kept in the file.")
+@_output("CAL.json", False, "Write the calibration file.")
+@click.option("--report", metavar="REPORT.html", help="Write a report, one HTML file.")
+@click.option("--allow-fail", is_flag=True, help="Write the calibration even where it failed.")
+@_reading
+@_overwrite
+@_json
+def align(recording: str, **given: Any) -> int:
+    """Calibrate a node against motion capture of the body that it is fixed to.
+
+    REF is a table with ref_qw ref_qx ref_qy ref_qz (body to laboratory, scalar first) and perhaps ref_p_x_m ..., marker
+    tracks, or a C3D file, on a clock of its own. Clock offset and drift, the delay of each sensor, the frames, the
+    lever arm, and B and H of every sensor come out at one go.
+    """
+    from margcal.apps.aligning import run
+
+    reading = _how_to_read(given)
+    names = ("method", "as_printed", "norm", "gravity", "field", "device")
+    options = {name: given.pop(name) for name in names}
+    return run(recording, reading=reading, options=options, **given)
+
+
+@cli.command()
 @click.argument("recordings", nargs=-1, metavar="[RECORDING]...")
 @click.option("--box", "hands", flag_value="box", default=None, help="A box that is put down on its faces (default).")
 @click.option("--free", "hands", flag_value="free", help="A node that is held or propped up in any attitude.")
@@ -238,6 +300,73 @@ def apply(calibration: str, recording: str, **given: Any) -> int:
     from margcal.apps.applying import run
 
     return run(calibration, recording, **given)
+
+
+@cli.command()
+@click.argument("recording", metavar="RECORDING")
+@click.option("--calibration", metavar="CAL.json", help="The node's calibration; without it units must be known.")
+@click.option(
+    "--filter",
+    default="vector-selection",
+    show_default=True,
+    metavar="NAME",
+    help="vector-selection, ekf-quest, gyro, vqf, vqf-offline.",
+)
+@click.option(
+    "--frame", type=click.Choice(["enu", "ned", "nwu"]), default="enu", show_default=True, help="Earth frame."
+)
+@click.option(
+    "--delays",
+    type=click.Choice(["file", "estimate", "none"]),
+    default="file",
+    show_default=True,
+    help="Correct the delays of the calibration; or tell the magnetometer's from the motion; or none.",
+)
+@click.option("--no-mag", is_flag=True, help="Leave the magnetometer out: relative heading.")
+@click.option("--start", metavar="W,X,Y,Z", help="Attitude at the start.  [default: from the first readings]")
+@click.option(
+    "--gyro-bias",
+    type=click.Choice(["rest", "none"]),
+    default="rest",
+    show_default=True,
+    help="Subtract the gyroscope's mean over rests (vqf finds its own).",
+)
+@_output("OUT", True, "A table (.csv, .parquet): t_s qw qx qy qz.")
+@_reading
+@_overwrite
+@_json
+def orient(recording: str, **given: Any) -> int:
+    """Follow the attitude of a node through a recording: t_s qw qx qy qz, node to earth."""
+    from margcal.apps.orienting import run
+
+    reading = _how_to_read(given)
+    return run(recording, reading=reading, **given)
+
+
+@cli.command()
+@click.argument("estimate", metavar="ESTIMATE")
+@click.argument("reference", metavar="REFERENCE")
+@click.option(
+    "--align-frames",
+    type=click.Choice(["none", "yaw", "full"]),
+    default="none",
+    show_default=True,
+    help="Turn the estimate before it is judged: about the vertical, or laboratory and body.",
+)
+@click.option("--align-time", is_flag=True, help="Move the estimate to where the angular speeds agree best.")
+@click.option("--all-samples", is_flag=True, help="Count those too in which the column movement is 0.")
+@_output("DIR", False, "Figures (JSON), errors (CSV) and a picture into this folder; PICTURE.svg: that only.")
+@_overwrite
+@_json
+def evaluate(estimate: str, reference: str, **given: Any) -> int:
+    """Say how good an estimate of attitude is, against a reference.
+
+    ESTIMATE is a table with t_s qw qx qy qz, REFERENCE a table or folder with ref_qw ... or qw ..., both of them body
+    to earth. Nothing is aligned unless asked.
+    """
+    from margcal.apps.evaluating import run
+
+    return run(estimate, reference, **given)
 
 
 @cli.command()
@@ -306,14 +435,101 @@ def simulate(duration_s: float | None, **given: Any) -> int:
 
 
 @cli.command()
-@click.argument("paper", type=click.Choice(["z-tie", "zy-tbme"]))
-@click.option("--runs", type=click.IntRange(min=2), default=1000, show_default=True, help="Of each simulation.")
+@click.argument("calibration", metavar="CAL.json", required=False)
+@click.option("--to", metavar="TARGET", help="Kind of file; --list shows all.")
+@_output("FILE", False, "The file.")
+@click.option("--list", "list_targets", is_flag=True, help="Show the targets and what each of them carries.")
+@_sensors
+@click.option(
+    "--scale",
+    metavar="acc=0.0048,...",
+    callback=_numbers,
+    help="What the target's driver makes of a raw count: m/s^2, rad/s, uT.",
+)
+@click.option("--field", type=click.FloatRange(min=1), metavar="uT", help="Strength of the field, if it is the unit.")
+@click.option(
+    "--max-loss",
+    type=click.FloatRange(min=0),
+    default=0.5,
+    show_default=True,
+    metavar="DEG",
+    help="Direction error that leaving numbers out may cost, rms.",
+)
+@click.option("--allow-lossy", is_flag=True, help="Write it whatever is lost or out of the target's range.")
+@click.option("--move-frame", is_flag=True, help="Turn the frame so that all of H fits (kalibr, basalt).")
+@click.option("--check", is_flag=True, help="Read the file back, compile it, and compute test vectors with it.")
+@_overwrite
+@_json
+def export(calibration: str | None, **given: Any) -> int:
+    """Write a calibration as C code, or in the file of another program.
+
+    What the target cannot hold is named with the direction error that it costs, and refused above --max-loss.
+    """
+    from margcal.apps.exporting import run_export
+
+    return run_export(calibration, **given)
+
+
+@cli.command(name="import")
+@click.argument("file", metavar="FILE")
+@click.option("--from", "source", metavar="SOURCE", required=True, help="Kind of file: see margcal export --list.")
+@_output("CAL.json", True, "The calibration file.")
+@click.option("--sensors", metavar="acc,gyr,mag", help="Which sensor FILE is of if it does not say; or only these.")
+@click.option(
+    "--units", metavar="acc=count,...", callback=_units, help="Units of the raw readings, if FILE does not say."
+)
+@click.option(
+    "--unit", metavar="mag=uT,...", callback=_units, help="Units of the calibrated vector, if FILE does not say."
+)
+@click.option(
+    "--scale",
+    metavar="acc=0.0048,...",
+    callback=_numbers,
+    help="What the other program's driver makes of a raw count; the calibration then takes counts.",
+)
+@click.option("--device", metavar="NAME", help="Name of the node, kept in the file.")
+@click.option("--frame", metavar="NAME", help="Frame of the calibrated vector, where FILE does not say it.")
+@_overwrite
+@_json
+def import_(file: str, **given: Any) -> int:
+    """Read another program's calibration file."""
+    from margcal.apps.exporting import run_import
+
+    return run_import(file, **given)
+
+
+@cli.command()
+@click.argument("calibration", metavar="CAL.json")
+@click.argument("recording", metavar="RECORDING")
+@click.option("--raw", metavar="RAW", help="The raw recording that RECORDING was made from: the answer is exact.")
+@_reading
+@_json
+def verify(calibration: str, recording: str, **given: Any) -> int:
+    """Say whether a recording that was calibrated elsewhere used this calibration the right way.
+
+    Names the usual mistakes: sign of the bias, transposed H, forward matrix, bias subtracted after H, wrong unit,
+    swapped axes. Raw columns beside the calibrated ones are used as --raw is. Without raw readings, four rests or more
+    are needed.
+    """
+    from margcal.apps.verifying import run
+
+    reading = _how_to_read(given)
+    return run(calibration, recording, reading=reading, **given)
+
+
+@cli.command()
+@click.argument("paper", type=click.Choice(["z-tie", "zy-tbme", "r-bsn", "effect"]))
+@click.option("--runs", type=click.IntRange(min=2), help="Of each simulation.  [default: 1000; r-bsn 10, effect 2]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @_output("DIR", False, "Tables (JSON, CSV) and figures (SVG) into this folder.")
 @_overwrite
 @_json
 def reproduce(paper: str, **given: Any) -> int:
-    """Print a paper's tables beside ours: z-tie and zy-tbme are the two that the solvers come from."""
+    """Print a paper's tables beside ours.
+
+    z-tie and zy-tbme are the two that the solvers come from, r-bsn is the alignment with motion capture.
+    effect says what each part of a calibration is worth for orientation, on public recordings (MARGCAL_DATA).
+    """
     from margcal.apps.papers.reproduce import run
 
     return run(paper, **given)

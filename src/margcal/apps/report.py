@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
+from margcal.apps.report_alignment import frame_pictures, masked, motion_residuals, orientation, timing
 from margcal.apps.report_attitudes import gallery
 from margcal.apps.report_checks import checks_of, checks_table
 from margcal.apps.report_data import attitudes, left_out, residuals
@@ -105,7 +106,9 @@ def _recorded(calibration: Calibration) -> Section | None:
     body = timelines(calibration)
     if not body:
         return None
-    lead = "Raw readings over time. Shaded: the node lay still. In between it was turned."
+    lead = "Raw readings over time."
+    if calibration.poses is not None and len(calibration.poses):
+        lead += " Shaded: the node lay still. In between it was turned."
     return Section("recorded", "What was recorded", lead, body)
 
 
@@ -159,7 +162,41 @@ def _sphere(calibration: Calibration) -> Section | None:
     return Section("sphere", "Before and after", lead, body)
 
 
+def _timing(calibration: Calibration) -> Section | None:
+    body = timing(calibration)
+    lead = "How node and optics were brought together in time, from the angular rates that both of them tell."
+    return Section("timing", "Timing", lead, body) if body else None
+
+
+def _frames(calibration: Calibration) -> Section | None:
+    body = frame_pictures(calibration)
+    lead = (
+        "How the node sits on the marker body, and how the optics' laboratory lies to the earth; seen from one place."
+    )
+    return Section("frames", "Frames", lead, body) if body else None
+
+
+def _orientation(calibration: Calibration) -> Section | None:
+    body = orientation(calibration)
+    lead = "What an orientation filter makes of the readings, held against the optics."
+    return Section("orientation", "Orientation", lead, body) if body else None
+
+
+def _motion(calibration: Calibration) -> Section | None:
+    body = motion_residuals(calibration)
+    lead = "How far each sensor is from what the optics say that it should have read. Shaded: the body was not seen."
+    return Section("motion", "Residuals over time", lead, body) if body else None
+
+
+def _masked(calibration: Calibration) -> Section | None:
+    body = masked(calibration)
+    lead = "What of the reference was not used. Gaps are left out, never bridged."
+    return Section("masked", "What was masked", lead, body) if body else None
+
+
 def _residuals(calibration: Calibration) -> Section | None:
+    if calibration.alignment is not None and not calibration.poses:
+        return None  # sample by sample against the optics, over time: above
     found = [r for kind in calibration.models if (r := residuals(calibration, kind)) is not None]
     if not found:
         return None
@@ -206,6 +243,11 @@ SECTIONS: Sequence[Callable[[Calibration], Section | None]] = (
     _findings,
     _expected,
     _checks,
+    _timing,
+    _frames,
+    _orientation,
+    _motion,
+    _masked,
     _recorded,
     _attitudes,
     _sphere,

@@ -14,7 +14,7 @@ MAX_CHECKS = 200
 WORDS = {
     "expected-error": ("Expected direction error", "From the covariance, rms over the sphere. This one decides.", "°"),
     "no-uncertainty": ("Expected direction error", "The method gives none.", "°"),
-    "residual": ("Residual", "What the fit leaves of the rests' readings, of the magnitude.", "%"),
+    "residual": ("Residual", "What the fit leaves of the readings, of the magnitude.", "%"),
     "turn-residual": ("Turns", "How far turns end from where the rests lie, rms.", "°"),
     "condition": ("Gains of the axes", "Largest over smallest; a healthy triad has about one.", ""),
     "gain": ("Gain and unit", "How far the gains are from what the raw unit says.", "%"),
@@ -22,10 +22,17 @@ WORDS = {
     "field-strength": ("Field strength", "By the nominal gain; the earth's is 20 to 70 µT.", "µT"),
     "dip": ("Dip of the field", "Off the World Magnetic Model.", "°"),
     "rests-remaining": ("Rests that remain", "After those that contradict the others were left out.", ""),
+    "synchronisation": ("Correlation of the rates", "Of node and optics, at the offset taken.", ""),
+    "clock-drift": ("Clock drift", "Of the node's clock against the optics'.", "ppm"),
+    "common-clock": ("Common clock", "Delay of the gyroscope behind the optics.", "s"),
+    "overlap": ("Overlap", "What node and optics have in common, of the shorter one.", "%"),
+    "reference-seen": ("Body seen", "Share of the optics' samples that were used.", "%"),
+    "axes": ("Axes", "How far they are turned from the gyroscope's.", "°"),
+    "mirrored-axes": ("Mirrored axes", "How far they are turned from the gyroscope's.", "°"),
     "housing-error": ("Housing", "How far it lay from the attitudes taken, rms about each axis.", "°"),
 }
 """Name, meaning and unit by code."""
-AT_LEAST = {"rests-remaining"}
+AT_LEAST = {"rests-remaining", "synchronisation", "overlap", "reference-seen"}
 """Codes whose limit is the least that passes."""
 LEVELS = {"pass": "passed", "warn": "warning", "fail": "failed"}
 
@@ -104,5 +111,6 @@ def _figure(value: float, unit: str) -> str:
     if not math.isfinite(value):
         return "–"
     shown = 100 * value if unit == "%" else value
-    text = number(shown, 2 if abs(shown) < 10 else 3)
+    near_one = unit == "" and 0.9 < shown < 1  # a correlation: not to be rounded to 1
+    text = number(shown, 4 if near_one else 2 if abs(shown) < 10 else 3)
     return f"{text}{'' if unit in ('', '°') else ' '}{unit}"

@@ -22,9 +22,23 @@ _SETTINGS = {
     "level_sd_deg": "Tilt of the table, sd in °",
     "units": "Units",
     "sources": "Taken from",
+    "static": "Trial at rest",
+    "common_clock": "Common clock",
+    "as_printed": "R-BSN (14) as printed",
+    "norm": "Norm of R-BSN (20)",
+    "alignment": "Alignment",
 }
 _HIDDEN = {"attitudes_figures", "checks"}
+_R_BSN = (
+    " R-BSN: Rüschen, Misgeld, Kim and Leonhardt, A Novel Algorithm for the Calibration of Inertial/Magnetic Sensors: "
+    "Application to a Body Sensor Network."
+)
 MAX_ISSUES = 300
+_MOTION = (
+    "This report was made from the calibration alone. The curves over time are in the report that is written along "
+    'with it: <code class="command">margcal align RECORDING --reference REF -o CALIBRATION.json --report '
+    "REPORT.html</code>"
+)
 _ALONE = (
     "This report was made from the calibration alone. Readings, attitudes and residuals are shown when it is given "
     'the recording too: <code class="command">margcal report CALIBRATION.json RECORDING -o REPORT.html</code>'
@@ -34,7 +48,9 @@ _ALONE = (
 def findings(calibration: Calibration) -> str:
     """The notes; failures and warnings stand under the verdict."""
     notes = [i for i in calibration.issues if i.level not in ("fail", "warn")]
-    alone = "" if calibration.recordings else f'<p class="quiet">{_ALONE}</p>'
+    alone = (
+        "" if calibration.recordings else f'<p class="quiet">{_ALONE if calibration.alignment is None else _MOTION}</p>'
+    )
     if not notes:
         return alone or '<p class="quiet">Nothing to report.</p>'
     return finding_list(notes) + alone
@@ -107,7 +123,7 @@ def _plain(value: Any) -> str:
     if isinstance(value, float):
         return number(value, 8)
     if isinstance(value, Mapping):
-        return ", ".join(f"{k} {_plain(v)}" for k, v in value.items())
+        return ", ".join(f"{str(k).replace('_', ' ')} {_plain(v)}" for k, v in value.items() if v is not None)
     if isinstance(value, Iterable) and not isinstance(value, str):
         return ", ".join(map(_plain, value))
     return str(value)
@@ -117,8 +133,9 @@ def _program(calibration: Calibration) -> str:
     parts = [esc(calibration.program, 80) if calibration.program else "margcal"]
     if calibration.created:
         parts.append(esc(calibration.created, 40))
+    paper = "" if calibration.alignment is None else _R_BSN
     return (
         f'<p class="program">{" · ".join(parts)}</p>'
         '<p class="program">Z-TIE: Zhang, IEEE Trans. Ind. Electron. 62(6), 2015, doi 10.1109/TIE.2014.2375258. '
-        "ZY-TBME: Zhang and Yang, IEEE Trans. Biomed. Eng. 62(2), 2015, doi 10.1109/TBME.2014.2360335.</p>"
+        f"ZY-TBME: Zhang and Yang, IEEE Trans. Biomed. Eng. 62(2), 2015, doi 10.1109/TBME.2014.2360335.{paper}</p>"
     )

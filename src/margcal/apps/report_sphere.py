@@ -22,7 +22,8 @@ KINDS: tuple[Kind, ...] = ("acc", "mag")
 def sphere_data(calibration: Calibration) -> dict[str, Any]:
     """What the viewer needs, by sensor; empty where there are no readings to show."""
     out: dict[str, Any] = {}
-    for kind in KINDS:
+    moved = calibration.alignment is not None and not calibration.poses
+    for kind in KINDS[1:] if moved else KINDS:  # what an accelerometer reads in motion lies on no sphere
         model = calibration.models.get(kind)
         if model is None or model.H.ndim != 2 or abs(np.linalg.det(model.H)) == 0:
             continue

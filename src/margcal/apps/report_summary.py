@@ -153,6 +153,8 @@ def _residual(calibration: Calibration, kind: Kind, model: SensorModel) -> str:
     from margcal.apps.report_data import shown_unit
 
     factor, unit = shown_unit(model)
+    if kind == "gyr" and calibration.alignment is not None and model.n_poses is None:
+        unit = "°/s"  # of every sample, not of turns
     found = residuals(calibration, kind)
     if found is not None and found.out.any():
         value = found.rms  # of what was not left out
@@ -162,5 +164,5 @@ def _residual(calibration: Calibration, kind: Kind, model: SensorModel) -> str:
         value = found.rms
     else:
         return ""
-    space = "" if unit[0] == "°" else " "
+    space = "" if unit == "°" else " "
     return f"{number(value, 3)}{space}{unit}"

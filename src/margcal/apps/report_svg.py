@@ -17,6 +17,8 @@ from margcal.core.types import Array
 
 WIDE, TALL = 2000, 1000
 """Units of a stretched picture: integers of this size are below half a pixel."""
+FOOT = 24.0
+"""Height in pixels of the axis below a picture."""
 
 
 @dataclass(frozen=True)
@@ -156,3 +158,32 @@ def plot_row(labels: str, plot: str, height: float, title: str) -> str:
         f'<svg class="ylabels" height="{height:g}" width="58" aria-hidden="true">{labels}</svg>'
         f'<svg class="area" height="{height:g}" width="100%" role="img" aria-label="{title}">{plot}</svg></div>'
     )
+
+
+def panel_frame(value: Scale, top: float, tall: float) -> tuple[str, str]:
+    """Scale labels and ground of a panel that is `tall` pixels high and lies `top` pixels down."""
+    ticks = value.ticks(4)
+    labels, ground = [], [f'<rect class="frame" x="0" y="{top:g}" width="100%" height="{tall:g}"/>']
+    for v, text in zip(ticks, tick_labels(ticks)):
+        y = top + (1 - float(value(v))) * tall
+        labels.append(f'<text class="tick" x="52" y="{y + 3.5:.1f}" text-anchor="end">{text}</text>')
+        ground.append(f'<line class="grid" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
+    return "".join(labels), "".join(ground)
+
+
+def axis_below(across: Scale, height: float, unit: str = "s") -> str:
+    """Ticks and numbers along the foot of a picture of this height; the first one says the unit."""
+    ticks = across.ticks(8)
+    parts = []
+    for i, (v, text) in enumerate(zip(ticks, tick_labels(ticks))):
+        x = float(across(v))
+        anchor = "start" if x < 0.02 else "end" if x > 0.98 else "middle"
+        thin = " thin" if i % 2 else ""
+        parts.append(
+            f'<line class="mark" x1="{percent(x)}" x2="{percent(x)}" y1="{height - FOOT:g}" y2="{height - 20:g}"/>'
+        )
+        parts.append(
+            f'<text class="tick{thin}" x="{percent(x)}" y="{height - 6:g}" text-anchor="{anchor}">'
+            f"{text}{f' {unit}' if i == 0 else ''}</text>"
+        )
+    return "".join(parts)

@@ -5,7 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from margcal.apps.report_svg import TALL, WIDE, Scale, percent, plot_row, scale_of, stretched, tick_labels, trace
+from margcal.apps.report_svg import (
+    FOOT,
+    TALL,
+    WIDE,
+    Scale,
+    axis_below,
+    panel_frame,
+    percent,
+    plot_row,
+    scale_of,
+    stretched,
+    trace,
+)
 from margcal.apps.report_text import NAMES, esc, fixed, listing, plural, unit_words
 from margcal.core import so3
 from margcal.core.types import Array, Calibration, Kind, Poses, Recording, Stream
@@ -14,8 +26,8 @@ BINS = 900
 MAX_RECORDINGS = 8
 MAX_RESTS = 200
 """More rests than this in a recording are shaded without numbers."""
-LANE, PANEL, SPACE, FOOT = 30.0, 104.0, 26.0, 24.0
-"""Heights in pixels: lane of the rests, panel of a sensor, room above it for its name, time axis."""
+LANE, PANEL, SPACE = 30.0, 104.0, 26.0
+"""Heights in pixels: lane of the rests, panel of a sensor, room above it for its name."""
 
 
 def timelines(calibration: Calibration) -> str:
@@ -47,13 +59,18 @@ def _timeline(calibration: Calibration, recording: Recording, index: int, bins: 
     labels, frames, curves = [], [], []
     for top, (kind, stream) in zip(tops, streams.items()):
         value = scale_of(stream.y)
-        ticks, frame = _frame(value, top)
+        ticks, frame = panel_frame(value, top, PANEL)
         labels.append(ticks)
         frames.append(frame)
         curves.append(_curves(stream, time, value, top, bins))
         name = f"{NAMES[kind].capitalize()}, {unit_words(stream.unit)}"
         curves.append(f'<text class="panel-name" x="0" y="{top - 7:g}">{name}</text>')
-    plot = [*frames, _time_axis(time, height), _rests(calibration, mine, time, tops), *curves]
+    plot = [
+        *frames,
+        axis_below(Scale(0.0, time.high - time.low), height),
+        _rests(calibration, mine, time, tops),
+        *curves,
+    ]
     title = f"Readings of {esc(recording.source)} over time with {plural(len(mine), 'rest')}"
     return (
         f'<figure class="timeline">{plot_row("".join(labels), "".join(plot), height, title)}'
@@ -126,41 +143,12 @@ def _turn(poses: Poses, before: int, after: int, time: Scale) -> str:
     return f'<line class="turn" x1="{percent(a)}" x2="{percent(b)}" y1="{y}" y2="{y}"><title>{title}</title></line>'
 
 
-def _frame(value: Scale, top: float) -> tuple[str, str]:
-    """Scale labels and ground of one sensor's panel."""
-    ticks = value.ticks(4)
-    labels, ground = [], [f'<rect class="frame" x="0" y="{top:g}" width="100%" height="{PANEL:g}"/>']
-    for v, text in zip(ticks, tick_labels(ticks)):
-        y = top + (1 - float(value(v))) * PANEL
-        labels.append(f'<text class="tick" x="52" y="{y + 3.5:.1f}" text-anchor="end">{text}</text>')
-        ground.append(f'<line class="grid" x1="0" x2="100%" y1="{y:.1f}" y2="{y:.1f}"/>')
-    return "".join(labels), "".join(ground)
-
-
 def _curves(stream: Stream, time: Scale, value: Scale, top: float, bins: int) -> str:
     lines = "".join(
         f'<path class="axis-{name}" d="{trace(stream.t, stream.y[:, k], time, value, bins)}"/>'
         for k, name in enumerate("xyz")
     )
     return stretched(lines, top, PANEL)
-
-
-def _time_axis(time: Scale, height: float) -> str:
-    since = Scale(0.0, time.high - time.low)
-    ticks = since.ticks(8)
-    parts = []
-    for i, (v, text) in enumerate(zip(ticks, tick_labels(ticks))):
-        x = float(since(v))
-        anchor = "start" if x < 0.02 else "end" if x > 0.98 else "middle"
-        thin = " thin" if i % 2 else ""
-        parts.append(
-            f'<line class="mark" x1="{percent(x)}" x2="{percent(x)}" y1="{height - FOOT:g}" y2="{height - 20:g}"/>'
-        )
-        parts.append(
-            f'<text class="tick{thin}" x="{percent(x)}" y="{height - 6:g}" text-anchor="{anchor}">'
-            f"{text}{' s' if i == 0 else ''}</text>"
-        )
-    return "".join(parts)
 
 
 def _caption(calibration: Calibration, recording: Recording, mine: Index) -> str:

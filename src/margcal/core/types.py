@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from margcal.core import compiled
 from margcal.core.errors import InputError
 from margcal.core.units import KINDS, SI_UNIT, Kind
 
@@ -122,6 +123,12 @@ class SensorModel:
         ndarray (..., 3), `unit`
         """
         y = np.asarray(y, dtype=np.float64)
+        kernels = compiled.extension()
+        if kernels is not None and self.H.ndim == 2 and y.ndim and y.shape[-1] == 3:
+            y = np.ascontiguousarray(y)
+            out = np.empty(y.shape)
+            kernels.apply(y.reshape(-1, 3), self.H, self.B, out.reshape(-1, 3))
+            return out
         with np.errstate(invalid="ignore", over="ignore"):  # a reading that is not finite is no accident here
             if self.H.ndim > 2:
                 return np.einsum("...ij,...j->...i", self.H, y - self.B)

@@ -33,15 +33,15 @@ Z-TIE's quaternions are scalar last (53); here they are scalar first.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from margcal.core import so3
+from margcal.core import compiled, so3
 from margcal.core.errors import InputError
-from margcal.core.types import Array, Turn
+from margcal.core.types import Array, Index, Turn
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,11 @@ def integrate_quat(y: ArrayLike, dt: ArrayLike, H: ArrayLike, B: ArrayLike | Non
         q_before_after. Its sign is that of the continuous path from the identity: a turn of more than half a
         revolution about a fixed axis has a negative scalar part.
     """
-    phi = rotation_vectors(y, dt, H, np.zeros(3) if B is None else B)
+    B = np.zeros(3) if B is None else B
+    found = _compiled_quat(y, dt, H, B)
+    if found is not None:
+        return found
+    phi = rotation_vectors(y, dt, H, B)
     half = 0.5 * np.moveaxis(phi, -1, 0)
     angle = np.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
     sinc = np.sinc(angle / np.pi)
@@ -139,6 +143,49 @@ def integrate_quat(y: ArrayLike, dt: ArrayLike, H: ArrayLike, B: ArrayLike | Non
         pairs = _multiply(q[..., 0:even:2], q[..., 1:even:2])  #                                           (54)
         q = np.concatenate([pairs, q[..., even:]], axis=-1)
     return np.moveaxis(q[..., 0], 0, -1)  #                                                                (55)
+
+
+def _compiled_quat(y: ArrayLike, dt: ArrayLike, H: ArrayLike, B: ArrayLike) -> Array | None:
+    """`integrate_quat` by the compiled kernel, or None without it (or without samples).
+
+    The kernel takes turns and sensors (H, B) as two lists, and for each result one index into either, so that
+    nothing is copied however the leading axes broadcast.
+    """
+    kernels = compiled.extension()
+    y, dt = np.asarray(y, dtype=np.float64), np.asarray(dt, dtype=np.float64)
+    if kernels is None or y.size == 0 or dt.size == 0:
+        return None
+    H, B = np.asarray(H, dtype=np.float64), np.asarray(B, dtype=np.float64)
+    samples = max(y.shape[-2], dt.shape[-1])
+    turns = np.broadcast_shapes(y.shape[:-2], dt.shape[:-1])
+    sensors = np.broadcast_shapes(H.shape[:-2], B.shape[:-1])
+    lead = np.broadcast_shapes(turns, sensors)
+    out = np.empty((*lead, 4))
+    kernels.integrate(
+        _flat(y, turns, (samples, 3)),
+        _flat(dt, turns, (samples,)),
+        _flat(H, sensors, (3, 3)),
+        _flat(B, sensors, (3,)),
+        _index(turns, lead),
+        _index(sensors, lead),
+        out.reshape(-1, 4),
+    )
+    return out
+
+
+def _flat(a: Array, lead: tuple[int, ...], tail: tuple[int, ...]) -> Array:
+    """`a` broadcast to leading axes `lead`, those as one, in contiguous memory."""
+    if a.shape != (*lead, *tail):
+        a = np.broadcast_to(a, (*lead, *tail))
+    return np.ascontiguousarray(a.reshape(-1, *tail))
+
+
+def _index(own: tuple[int, ...], lead: tuple[int, ...]) -> Index:
+    """For each element of shape `lead` the flat index of the element of shape `own` that broadcasts to it."""
+    count = math.prod(own)
+    if own == lead:
+        return np.arange(count)
+    return np.broadcast_to(np.arange(count).reshape(own), lead).ravel()
 
 
 def _multiply(a: Array, b: Array) -> Array:
@@ -236,6 +283,9 @@ def preintegrate(
     """
     y, dt = np.asarray(y, dtype=np.float64), np.asarray(dt, dtype=np.float64)
     H, B = np.asarray(H, dtype=np.float64), np.zeros(3) if B is None else np.asarray(B, dtype=np.float64)
+    kernels = compiled.extension()
+    if kernels is not None and y.ndim == 3 and dt.shape == y.shape[:2] and H.ndim == 2 and B.ndim == 1 and y.size:
+        return _compiled_preintegrate(kernels.preintegrate, y, dt, H, B, sd)
     turns, samples = dt.shape[0] if dt.ndim else 1, dt.shape[-1]
     if y.ndim == 3 and H.ndim == 2 and turns > 1 and turns * samples > _CHUNK:
         return _in_chunks(y, dt, H, B, sd)
@@ -255,6 +305,17 @@ def preintegrate(
         noise = H * (np.asarray(sd, dtype=np.float64) * np.ones(3))
         gram = (A @ np.swapaxes(A, -1, -2)).reshape(*lead, 3, 3, 3, 3)
         C = back @ np.einsum("...iakb,...ab->...ik", gram, noise @ np.swapaxes(noise, -1, -2)) @ dR
+    return Preintegrated(dR, J_H, J_B, C)
+
+
+def _compiled_preintegrate(
+    kernel: Callable[..., None], y: Array, dt: Array, H: Array, B: Array, sd: ArrayLike | None
+) -> Preintegrated:
+    """`preintegrate` of turns (T, N, 3) by the compiled kernel."""
+    noise = H * ((0.0 if sd is None else np.asarray(sd, dtype=np.float64)) * np.ones(3))
+    dR, J_H, J_B, C = (np.empty((len(y), 3, n)) for n in (3, 9, 3, 3))
+    y, dt, H, B = (np.ascontiguousarray(a) for a in (y, dt, H, B))
+    kernel(y, dt, H, B, noise @ noise.T, dR, J_H, J_B, C)
     return Preintegrated(dR, J_H, J_B, C)
 
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from margcal.core import so3
+from margcal.core import compiled, so3
 from margcal.core.errors import UsageError
 from margcal.core.types import Array, Issue, Kind, Poses, Recording, Stream, Turn
 from margcal.core.units import KINDS
@@ -131,6 +131,11 @@ def measured(recording: Recording) -> Recording:
 def _windows(t: Array, y: Array, centres: Array, width: float) -> tuple[Array, Array]:
     """Scatter (norm over the axes) and mean of the samples within `width` s of each centre; NaN where fewer
     than four samples or a gap lie there."""
+    kernels = compiled.extension()
+    if kernels is not None and len(t) > 1 and width > 0:
+        sd, mean = np.empty(len(centres)), np.empty((len(centres), 3))
+        kernels.moving_scatter(t, np.ascontiguousarray(y), centres, width, sd, mean)
+        return sd, mean
     lo = np.searchsorted(t, centres - width / 2)
     hi = np.searchsorted(t, centres + width / 2)
     n = hi - lo

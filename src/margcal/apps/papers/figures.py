@@ -72,17 +72,24 @@ class Panel:
 
 def figure(title: str, panels: Sequence[Panel], *, width: float = 460, height: float = 340) -> str:
     """The SVG of panels side by side under a common title."""
-    total = width * len(panels)
+    return stacked(title, [panels], width=width, height=height)
+
+
+def stacked(title: str, rows: Sequence[Sequence[Panel]], *, width: float = 460, height: float = 300) -> str:
+    """The SVG of several rows of panels under a common title."""
+    total, tall = width * max(len(row) for row in rows), 34 + height * len(rows)
     name = f"c{zlib.crc32(title.encode()):x}"  # of clip paths: several figures may stand on one page
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total:g} {height + 34:g}" width="{total:g}" '
-        f'height="{height + 34:g}" font-family="system-ui, sans-serif" font-size="12" role="img">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total:g} {tall:g}" width="{total:g}" '
+        f'height="{tall:g}" font-family="system-ui, sans-serif" font-size="12" role="img">',
         f"<title>{esc(title)}</title>",
-        f'<rect width="{total:g}" height="{height + 34:g}" fill="#ffffff"/>',
+        f'<rect width="{total:g}" height="{tall:g}" fill="#ffffff"/>',
         f'<text x="14" y="24" font-size="15" font-weight="600" fill="#111827">{esc(title)}</text>',
     ]
-    for i, panel in enumerate(panels):
-        parts.append(f'<g transform="translate({i * width:g} 34)">{_draw(panel, width, height, f"{name}-{i}")}</g>')
+    for j, row in enumerate(rows):
+        for i, panel in enumerate(row):
+            place = f"translate({i * width:g} {34 + j * height:g})"
+            parts.append(f'<g transform="{place}">{_draw(panel, width, height, f"{name}-{j}-{i}")}</g>')
     return "\n".join([*parts, "</svg>", ""])
 
 

@@ -9,10 +9,12 @@ from margcal.apps import screen
 from margcal.apps.outputs import check_outputs
 from margcal.apps.papers import tables
 
-PAPERS = ("z-tie", "zy-tbme")
+PAPERS = {"z-tie": 1000, "zy-tbme": 1000, "r-bsn": 10, "effect": 2}
+"""Papers and the runs of each where nothing is said; a run of R-BSN is three nodes of three trials, one of `effect` a
+corrupted node in each of eight trials."""
 
 
-def run(paper: str, *, runs: int, seed: int, output: str | None, overwrite: bool, as_json: bool) -> int:
+def run(paper: str, *, runs: int | None, seed: int, output: str | None, overwrite: bool, as_json: bool) -> int:
     """The verb; `paper` is one of `PAPERS`."""
     from margcal.files.atomic import atomic_folder
 
@@ -20,9 +22,13 @@ def run(paper: str, *, runs: int, seed: int, output: str | None, overwrite: bool
     with screen.progress(f"reproducing {paper}") as tick:
         if paper == "z-tie":
             from margcal.apps.papers.z_tie import reproduce
+        elif paper == "r-bsn":
+            from margcal.apps.papers.r_bsn import reproduce
+        elif paper == "effect":
+            from margcal.apps.papers.effect import reproduce
         else:
             from margcal.apps.papers.zy_tbme import reproduce
-        result = reproduce(runs, seed, tick)
+        result = reproduce(PAPERS[paper] if runs is None else runs, seed, tick)
     if output is not None:
         with atomic_folder(output, overwrite=overwrite) as folder:
             tables.write(result, folder)

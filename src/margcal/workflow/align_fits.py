@@ -1,0 +1,425 @@
+"""The sensors of a node against its reference: delays, fits in the marker body's axes, one frame for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from margcal.core import so3
+from margcal.core.errors import DataError
+from margcal.core.types import Array, Fit, Issue, Kind, Mask, SensorModel, Stream
+from margcal.methods import mocap_fit
+from margcal.methods.clock import gyroscope_at_reference
+from margcal.methods.delays import SensorDelay, accelerometer_delay, delay_of, delay_of_lowest
+from margcal.methods.mocap_excitation import attitude_excitation, rate_excitation
+from margcal.methods.mocap_frame import CommonFrame, common_frame, earth_from_laboratory
+from margcal.methods.r_bsn import RBsn, laboratory_vector, polar_split, r_bsn
+from margcal.methods.reference_rates import attitude_at, reference_rates, resample
+from margcal.workflow.align_diagnose import check_laboratory
+from margcal.workflow.align_job import AlignJob, AlignSolved, Tick
+from margcal.workflow.job import NAMES
+
+TOLD_SE_S = 4e-3
+"""A delay whose standard error is larger is not known, and not corrected."""
+EXPLAINED = 0.02
+"""Share of the sensor's changes that the prediction must account for before its delay means anything."""
+THINNED_HZ = 50.0
+"""Rate that is enough to see what is left below the cut-off of `lowpass-svd`."""
+DELAY_MATTERS_S = 5e-4
+"""A delay that moves by more makes the accelerometer's fit worth repeating."""
+LARGEST_DELAY_S = 0.3
+APART, WIDE = 2.0, 0.005
+"""Standard errors between the two estimates of T from which errors are widened; difference that is warned of."""
+
+
+def solve(job: AlignJob, tick: Tick) -> AlignSolved:
+    """Every sensor by the job's method; one that the motion does not carry is left out with the reason."""
+    return _paper(job, tick) if job.options.method == "r-bsn" else _right(job, tick)
+
+
+# --- readings and attitudes at the same times -----------------------------------------------------------
+
+
+def _placed(job: AlignJob, stream: Stream, delay: float) -> tuple[Array, Array, Array | None, Mask]:
+    """Times on the reference's clock at which the readings were sensed, R_mk and p there, and where these are known."""
+    t = job.sync.reference_time(stream.t - delay)
+    R = attitude_at(job.reference, t)
+    known: Mask = np.atleast_1d(np.isfinite(R).all(axis=(1, 2)))
+    p = None
+    if job.reference.p is not None:
+        p = resample(job.reference.t, job.reference.p, t)
+    return t, R, p, _fast_length(t, known)
+
+
+def _fast_length(t: Array, known: Mask) -> Mask:
+    """`known` without the last few samples, so that the spectra's length has no prime factor above 5.
+
+    Lengths with large primes cost fifteen times as much; at most 1.6 % is left out, usually 0.2.
+    """
+    seen = np.flatnonzero(known)
+    if len(seen) < 2000:
+        return known
+    first, last = seen[[0, -1]]
+    step = float(np.median(np.diff(t[first : last + 1])))
+    count = round(float(t[last] - t[first]) / step) + 1
+    smooth = max(
+        2**a * 3**b * 5**c for a in range(1, 26) for b in range(4) for c in range(4) if 2**a * 3**b * 5**c <= count
+    )
+    return known & (t < t[first] + (smooth - 0.5) * step)
+
+
+def magnetometer_delay(job: AlignJob, rounds: int = 3) -> SensorDelay:
+    """Of the magnetometer, from the field turned into the marker body.
+
+    Raises
+    ------
+    DataError
+        If the attitudes do not tell the field.
+    """
+    found = _magnetometer_delay(job, job.sync.delay_s)
+    for _ in range(rounds - 1):
+        last, found = found.delay_s, _magnetometer_delay(job, found.delay_s)
+        if abs(found.delay_s - last) < 1e-4:
+            break
+    return found
+
+
+def _magnetometer_delay(job: AlignJob, start: float) -> SensorDelay:
+    """One round: the field in the laboratory for a delay of `start`, then the delay for that field."""
+    mag = job.recording.streams["mag"]
+    _, R, _, known = _placed(job, mag, start)
+    h = laboratory_vector(mag.y[known], R[known], so3.nearest_rotation(job.sync.T))
+    u = np.einsum("nji,j->ni", job.rates.R, h)
+    return delay_of(job.sync.reference_time(mag.t), mag.y, job.rates.t, u, start=start)
+
+
+def _usable(delay: SensorDelay) -> bool:
+    told = np.isfinite(delay.se_s) and delay.se_s < TOLD_SE_S and abs(delay.delay_s) < LARGEST_DELAY_S
+    return bool(told and delay.explained > EXPLAINED)
+
+
+def _unknown_delay(kind: Kind, delay: SensorDelay | None) -> Issue:
+    why = "the motion does not tell it" if delay is None else f"standard error {1e3 * delay.se_s:.1f} ms"
+    text = f"{NAMES[kind]}: its delay is not known ({why}); it is taken to be the gyroscope's"
+    return Issue("delay-not-known", "note", text, kind, None if delay is None else delay.se_s, TOLD_SE_S)
+
+
+# --- the right way --------------------------------------------------------------------------------------
+
+
+def _right(job: AlignJob, tick: Tick) -> AlignSolved:
+    solved, wanted = AlignSolved(), job.options.sensors
+    fits: dict[Kind, Fit] = {}
+    _gyroscope(job, solved, fits)
+    tick(4, 9)
+    if "mag" in wanted:
+        _attempt(solved, "mag", lambda: _magnetometer(job, solved), fits)
+    tick(6, 9)
+    if "acc" in wanted:
+        _attempt(solved, "acc", lambda: _accelerometer(job, solved), fits)
+    tick(8, 9)
+    if "gyr" not in fits:
+        raise DataError(solved.issues[-1].text, solved.issues)
+    _same_handed(job, fits)
+    frame = common_frame(fits["gyr"], fits.get("acc"), fits.get("mag"))
+    _take_frame(job, solved, frame, fits)
+    return solved
+
+
+def _attempt(solved: AlignSolved, kind: Kind, make: Callable[[], Fit], fits: dict[Kind, Fit]) -> None:
+    """Keep the fit of a sensor, or why there is none."""
+    try:
+        fits[kind] = make()
+    except DataError as error:
+        reasons = error.issues or (Issue("cannot-align", "fail", f"{NAMES[kind]}: {error}", kind),)
+        solved.issues += [replace(i, level="fail", sensor=i.sensor or kind) for i in reasons]
+
+
+def _gyroscope(job: AlignJob, solved: AlignSolved, fits: dict[Kind, Fit]) -> None:
+    sync, gyr = job.sync, job.recording.streams["gyr"]
+    solved.delays["gyr"] = (sync.delay_s, sync.delay_se_s if sync.common_clock else 0.0)
+    t, R, _, known = _placed(job, gyr, sync.delay_s)
+    _attempt(solved, "gyr", lambda: mocap_fit.gyroscope(t, gyr.y, R, known, raw_unit=gyr.unit), fits)
+    if "gyr" in fits:
+        fits["gyr"] = _widened(job, solved, fits["gyr"])
+    if "gyr" in fits and job.static_bias is not None:
+        fits["gyr"] = _with_static(fits["gyr"], *job.static_bias)
+
+
+def _widened(job: AlignJob, solved: AlignSolved, fit: Fit) -> Fit:
+    """The fit with errors as large as the two estimates of T differ: that of the synchronisation weights slow and fast
+    turning differently, and what is neither noise nor a gain (a mount that gives way) shows between them."""
+    C = fit.covariance
+    if C is None:
+        return fit
+    variance = np.diag(C)[:9] + np.diag(job.sync.covariance)[:9]
+    apart = float(np.sqrt(np.mean((fit.model.H - job.sync.T).ravel() ** 2 / variance)))
+    if apart <= APART:
+        return fit
+    size = float(np.abs(fit.model.H - job.sync.T).max() / np.linalg.norm(job.sync.T, 2))
+    text = (
+        f"gyroscope: slow and fast turning tell gains up to {100 * size:.1f} % apart, {apart:.0f} standard errors; the "
+        "errors are widened to that: a mount that gives way, or too little rotation about an axis"
+    )
+    solved.issues.append(Issue("errors-widened", "warn" if size > WIDE else "note", text, "gyr", apart, APART))
+    C = C * apart**2
+    return replace(fit, model=replace(fit.model, covariance=C), covariance=C)
+
+
+def _with_static(fit: Fit, b: Array, se: Array) -> Fit:
+    """# not in the paper: (12) as one more observation of B, weighted with what the moved trial says of it."""
+    model, C = fit.model, fit.covariance
+    if C is None:
+        return replace(fit, model=replace(model, B=b))
+    gain = C[:, 9:] @ np.linalg.inv(C[9:, 9:] + np.diag(se**2))
+    x = np.concatenate([model.H.ravel(), model.B]) + gain @ (b - model.B)
+    C = C - gain @ C[9:, :]
+    C = (C + C.T) / 2
+    return replace(fit, model=replace(model, H=x[:9].reshape(3, 3), B=x[9:], covariance=C), covariance=C)
+
+
+def _magnetometer(job: AlignJob, solved: AlignSolved) -> Fit:
+    mag = job.recording.streams["mag"]
+    d = job.sync.delay_s
+    delay = magnetometer_delay(job)
+    if _usable(delay):
+        d = delay.delay_s
+        solved.delays["mag"] = (d, delay.se_s)
+    else:
+        solved.issues.append(_unknown_delay("mag", delay))
+    t, R, _, known = _placed(job, mag, d)
+    return mocap_fit.magnetometer(t, mag.y, R, known, field=job.options.field_uT, raw_unit=mag.unit)
+
+
+def _accelerometer(job: AlignJob, solved: AlignSolved) -> Fit:
+    acc, d, options = job.recording.streams["acc"], job.sync.delay_s, job.options
+    t, R, p, known = _placed(job, acc, d)
+    if options.method == "lowpass-svd" or p is None:
+        return _low_passed(job, solved)
+    rough = mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=options.gravity, raw_unit=acc.unit)
+    check_laboratory(acc, job.rates, job.sync, rough.model.H, rough.model.B)
+    known = known & np.isfinite(p).all(axis=1)
+    fit = mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit)
+    delay = accelerometer_delay(job.sync.reference_time(acc.t), acc.y, job.rates, start=d)
+    if not _usable(delay):
+        solved.issues.append(_unknown_delay("acc", delay))
+        return fit
+    solved.delays["acc"] = (delay.delay_s, delay.se_s)
+    t, R, p, known = _placed(job, acc, delay.delay_s)
+    if p is None or abs(delay.delay_s - d) <= DELAY_MATTERS_S:
+        return fit
+    known = known & np.isfinite(p).all(axis=1)
+    return mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit)
+
+
+def _low_passed(job: AlignJob, solved: AlignSolved) -> Fit:
+    """Without positions: the delay, too, from what is left below the cut-off."""
+    acc, start = job.recording.streams["acc"], job.sync.delay_s
+
+    def fit(acc: Stream, delay: float, *, gate: bool = True) -> Fit:
+        t, R, _, known = _placed(job, acc, delay)
+        return mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=job.options.gravity, raw_unit=acc.unit, gate=gate)
+
+    first = fit(acc, start)
+    thin = max(1, int(acc.rate / THINNED_HZ))
+    few = replace(acc, t=acc.t[::thin], y=acc.y[::thin])
+    # one equation a period of the cut-off: motion is no white noise, and so the errors come out right in simulation
+    freedom = mocap_fit.CUTOFF_HZ * np.count_nonzero(job.rates.valid) / job.rates.rate
+    delay = delay_of_lowest(lambda d: float(fit(few, d, gate=False).cost), start=start, freedom=freedom)
+    if not (np.isfinite(delay.se_s) and delay.se_s < TOLD_SE_S):
+        solved.issues.append(_unknown_delay("acc", delay))
+        return first
+    solved.delays["acc"] = (delay.delay_s, delay.se_s)
+    return fit(acc, delay.delay_s)
+
+
+def _same_handed(job: AlignJob, fits: dict[Kind, Fit]) -> None:
+    """Signs that the fits leave open: (H, u) and (-H, -u). The dip where the place is known; a mirrored node."""
+    acc, mag, k = fits.get("acc"), fits.get("mag"), job.mirrored
+    if k is not None:
+        # with the gyroscope's axis k reversed in the data the others are taken for reversed as well
+        flip = np.diag(np.where(np.arange(3) == "xyz".index(k), -1.0, 1.0))
+        C = so3.nearest_rotation(job.sync.T)
+        for kind, fit in list(fits.items()):
+            if kind == "gyr" or fit.model.method == "forward":
+                continue  # positions tell an accelerometer's sign
+            nearness = float(np.trace(C.T @ so3.polar(fit.model.H)[0] @ flip))
+            if nearness < 0:
+                fits[kind] = _negated(fit)
+    acc, mag = fits.get("acc"), fits.get("mag")
+    if job.options.dip is None or acc is None or mag is None or acc.u is None or mag.u is None:
+        return
+    if float(acc.u @ mag.u) * np.sin(job.options.dip) > 0:  # the field points down where the dip is positive
+        fits["mag"] = _negated(mag)
+
+
+def _negated(fit: Fit) -> Fit:
+    """(-H, B, -u) with its covariance."""
+    signs = np.concatenate([-np.ones(9), np.ones(3)])
+    C = None if fit.covariance is None else fit.covariance * np.outer(signs, signs)
+    u = None if fit.u is None else -fit.u
+    details = dict(fit.details)
+    if "joint" in details:
+        joint = np.concatenate([signs, -np.ones(3), np.ones(len(details["joint"]) - 15)])
+        details["joint"] = details["joint"] * np.outer(joint, joint)
+    model = replace(fit.model, H=-fit.model.H, covariance=C, reference_vector=u)
+    return replace(fit, model=model, u=u, covariance=C, details=details)
+
+
+def _take_frame(job: AlignJob, solved: AlignSolved, frame: CommonFrame, fits: dict[Kind, Fit]) -> None:
+    for kind in job.options.sensors:
+        model = {"acc": frame.acc, "gyr": frame.gyr, "mag": frame.mag}[kind]
+        if model is not None:
+            solved.models[kind] = model
+            solved.fits[kind] = replace(fits[kind], model=model, covariance=model.covariance)
+    solved.R_kh, solved.R_kh_se = frame.R_kh, frame.R_kh_se
+    solved.R_nm, solved.R_nm_se = frame.R_nm, frame.R_nm_se
+    acc, mag = fits.get("acc"), fits.get("mag")
+    solved.f_m = None if acc is None else acc.u
+    solved.h_m = None if mag is None else mag.u
+    if acc is not None and "lever_arm" in acc.details:
+        se = np.sqrt(np.maximum(np.diag(acc.details["joint"])[15:18], 0.0))
+        solved.lever_arm = (np.asarray(acc.details["lever_arm"]), se)
+
+
+# --- the paper's way ------------------------------------------------------------------------------------
+
+
+def _paper(job: AlignJob, tick: Tick) -> AlignSolved:
+    solved, sync, rates, options = AlignSolved(), job.sync, job.rates, job.options
+    streams = job.recording.streams
+    solved.delays["gyr"] = (sync.delay_s, sync.delay_se_s if sync.common_clock else 0.0)
+    delays = {"acc": sync.delay_s, "mag": sync.delay_s}
+    if "mag" in options.sensors:
+        try:  # not in the paper, which takes all sensors for simultaneous
+            found = magnetometer_delay(job)
+            if _usable(found):
+                delays["mag"] = found.delay_s
+                solved.delays["mag"] = (found.delay_s, found.se_s)
+        except DataError:
+            pass
+    tick(5, 9)
+    node = sync.node_time(rates.t)
+    w_ref = reference_rates(job.reference, as_printed=True).w if options.as_printed else rates.w
+    turning = rate_excitation(rates.w[rates.valid])
+    if turning.level == "fail":
+        raise DataError(turning.text, (Issue("poor-excitation", "fail", turning.text, "gyr"),))
+    readings = {
+        kind: y
+        for kind in ("acc", "mag")
+        if kind in options.sensors
+        and (y := _excited(job, solved, kind, resample(streams[kind].t, streams[kind].y, node + delays[kind])))
+        is not None
+    }
+    gyr = gyroscope_at_reference(sync, streams["gyr"].t, streams["gyr"].y, rates)
+    found = r_bsn(
+        w_ref,
+        rates.R,
+        gyr,
+        readings.get("acc"),
+        readings.get("mag"),
+        b_w=None if job.static_bias is None else job.static_bias[0],
+        gravity=options.gravity,
+        field=options.field_uT or 1.0,
+        norm=options.norm,
+        units={k: (s.unit, options.units[k]) for k, s in streams.items()},
+        allow_mirrored=options.as_printed,
+    )
+    tick(8, 9)
+    _take_paper(job, solved, found)
+    if options.as_printed:
+        solved.issues.append(_as_printed(job, gyr - found.fits["gyr"].model.B, w_ref, found.T))
+    return solved
+
+
+def _excited(job: AlignJob, solved: AlignSolved, kind: Kind, y: Array) -> Array | None:
+    """The readings, if the attitudes in which they were taken can carry a fit."""
+    use = np.isfinite(y).all(axis=1) & job.rates.valid
+    R = job.rates.R[use]
+    try:
+        v = laboratory_vector(y[use], R, so3.nearest_rotation(job.sync.T))
+        spread = attitude_excitation(kind, np.einsum("nji,j->ni", R, v))
+        text = spread.text if spread.level == "fail" else None
+    except DataError as error:
+        text = str(error)
+    if text is None:
+        return y
+    solved.issues.append(Issue("poor-excitation", "fail", text, kind))
+    return None
+
+
+def _as_printed(job: AlignJob, Omega: Array, w_ref: Array, T: Array) -> Issue:
+    """What (14) as printed leaves of the rate, beside what it leaves corrected."""
+    use = np.isfinite(Omega).all(axis=1) & np.isfinite(w_ref).all(axis=1)
+    left = np.sum((w_ref[use] - Omega[use] @ T.T) ** 2) / np.sum(w_ref[use] ** 2)
+    text = (
+        f"(14) as printed gives the rate in the laboratory's axes: T leaves {100 * left:.0f} % of its square "
+        f"(corrected {100 * (1 - job.sync.explained):.2f} %), det T {np.linalg.det(T):.3g} (corrected "
+        f"{np.linalg.det(job.sync.T):.3g}); everything that follows is in no known frame"
+    )
+    return Issue("as-printed", "fail", text, None, float(left), 1 - job.sync.explained)
+
+
+def _take_paper(job: AlignJob, solved: AlignSolved, found: RBsn) -> None:
+    fits = dict(found.fits)
+    if "mag" in fits and "acc" in fits and job.options.dip is not None and found.f_m is not None:
+        h = fits["mag"].u
+        if h is not None and float(found.f_m @ h) * np.sin(job.options.dip) > 0:
+            fits["mag"] = _negated(fits["mag"])
+    fits["gyr"] = _gyroscope_covariance(job, fits["gyr"], found)
+    for kind in job.options.sensors:
+        if kind in fits:
+            solved.fits[kind] = fits[kind]
+            solved.models[kind] = fits[kind].model
+    solved.R_kh = found.C_b
+    solved.f_m, solved.h_m = found.f_m, fits["mag"].u if "mag" in fits else None
+    if solved.f_m is not None and solved.h_m is not None:
+        solved.R_nm = earth_from_laboratory(solved.f_m, solved.h_m)
+    if "acc" in fits and found.gated < 0.999:
+        text = (
+            f"accelerometer: {100 * (1 - found.gated):.0f} % of the samples were left out by the gate of (20) "
+            "(linear acceleration)"
+        )
+        solved.issues.append(Issue("gated", "note", text, "acc", 1 - found.gated))
+
+
+def _gyroscope_covariance(job: AlignJob, fit: Fit, found: RBsn) -> Fit:
+    """Covariance of (K_w row by row, b_w) from that of T (jackknife) and of b_w, K_w = C^bT T sym by numbers."""
+    T, step = found.T, 1e-6 * float(np.linalg.norm(found.T))
+    J = np.zeros((12, 9))
+    se = np.zeros(9)
+    for k in range(9):
+        moved = T.copy()
+        moved[k // 3, k % 3] += step
+        try:
+            J[:9, k] = (polar_split(moved, True)[1] - fit.model.H).ravel() / step
+            se[k] = 1.0
+        except DataError:
+            continue
+    C = J @ found.T_covariance @ J.T
+    if job.static_bias is not None:
+        C[9:, 9:] = np.diag(job.static_bias[1] ** 2)
+    else:
+        Tinv = np.linalg.inv(job.sync.T)
+        C[9:, 9:] = Tinv @ job.sync.covariance[9:, 9:] @ Tinv.T
+    model = replace(fit.model, covariance=(C + C.T) / 2)
+    return replace(fit, model=model, covariance=model.covariance)
+
+
+# --- a mirrored gyroscope -------------------------------------------------------------------------------
+
+
+def with_axis_reversed(stream: Stream, axis: str) -> Stream:
+    """The stream with one axis' sign turned round."""
+    signs = np.where(np.arange(3) == "xyz".index(axis), -1.0, 1.0)
+    return replace(stream, y=stream.y * signs)
+
+
+def of_raw_axes(model: SensorModel, axis: str) -> SensorModel:
+    """The model for raw readings, from one for readings with that axis reversed."""
+    signs = np.where(np.arange(3) == "xyz".index(axis), -1.0, 1.0)
+    both = np.concatenate([np.tile(signs, 3), signs])
+    C = None if model.covariance is None else model.covariance * np.outer(both, both)
+    return replace(model, H=model.H * signs, B=model.B * signs, covariance=C)

@@ -1,0 +1,296 @@
+"""The attitude of a node through a recording: calibration applied, one clock, a filter run, and what to know of it.
+
+What is done before the filter sees anything, in this order: readings to SI units (H and B of the calibration, or the
+units of the columns); readings at the end of a sensor's range are taken as not measured; every sensor is brought to
+the gyroscope's clock by interpolation, its delay corrected (the reading stamped t + delay was sensed at t), never
+beyond its ends nor across a gap; rests give the gyroscope's bias, the length of gravity and the dip, the first of them
+the attitude to start from. The filter works in ENU with y to magnetic north; other frames are made from it at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from margcal.core import so3
+from margcal.core.errors import InputError, UsageError
+from margcal.core.types import Array, Attitude, Calibration, Issue, Kind, Mask, Recording, Stream
+from margcal.methods.filters import DEFAULT, Filter, Surroundings, find_filter
+from margcal.methods.tracking import ACC, GAP, MAG, NO_GYR, Flags, Track, to_plain
+from margcal.workflow.orient_start import Rests, find_rests, first_attitude, surroundings_of
+from margcal.workflow.orient_streams import NAMES, Samples, delays_to_correct, one_clock, si_streams
+
+Frame = Literal["enu", "ned", "nwu"]
+Delays = Literal["file", "estimate", "none"]
+Progress = Callable[[int, int], None]
+
+_HALF = math.sqrt(0.5)
+FRAMES: dict[str, tuple[float, float, float, float]] = {
+    "enu": (1.0, 0.0, 0.0, 0.0),
+    "ned": (0.0, _HALF, _HALF, 0.0),
+    "nwu": (_HALF, 0.0, 0.0, -_HALF),
+}
+"""Quaternion that takes components from ENU to each earth frame."""
+
+CHUNK = 20_000
+"""Samples between two ticks of the progress bar."""
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """What `orient` returns.
+
+    Attributes
+    ----------
+    attitude : Attitude
+        Node to earth at the gyroscope's times, unit quaternions of continuous sign.
+    variance : ndarray (N, 3), rad^2
+        What the filter believes its error to be about east, north and up; NaN where it does not say.
+    flags : ndarray (N,), uint8
+        Bits of `methods.tracking`: `ACC`, `MAG` were used, `NO_GYR`, `GAP`.
+    filter, frame : str
+    params, state : dict
+        The filter's, as plain lists and numbers: what is needed to go on later.
+    figures : dict
+        Numbers that the issues speak of: shares used, bias removed, delays, field, dip.
+    issues : tuple of Issue
+    """
+
+    attitude: Attitude
+    variance: Array = field(repr=False)
+    flags: Flags = field(repr=False)
+    filter: str
+    frame: str
+    params: Mapping[str, Any]
+    state: Mapping[str, Any]
+    figures: Mapping[str, Any]
+    issues: tuple[Issue, ...]
+
+
+def orient(
+    recording: Recording,
+    calibration: Calibration | None = None,
+    *,
+    filter: str = DEFAULT,
+    frame: Frame = "enu",
+    delays: Delays = "file",
+    mag: bool = True,
+    q0: ArrayLike | None = None,
+    gyro_bias: Literal["rest", "none"] = "rest",
+    progress: Progress | None = None,
+) -> Orientation:
+    """Attitudes of a node through a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        Raw, with the `calibration` that it fits, or in units that are known.
+    calibration : Calibration, optional
+    filter : str
+        A name in `methods.filters.FILTERS`.
+    frame : {'enu', 'ned', 'nwu'}
+        The earth frame of the result (x, y, z: east, magnetic north, up; north, east, down; north, west, up).
+    delays : {'file', 'estimate', 'none'}
+        Correct those of the calibration file; or take the magnetometer's against the gyroscope from this recording
+        (the others from the file); or correct none.
+    mag : bool
+        Use the magnetometer. Without it the heading starts at zero (or at that of `q0`) and drifts.
+    q0 : array_like (4,), optional
+        Attitude at the start, scalar first, in `frame`.
+    gyro_bias : {'rest', 'none'}
+        Subtract the gyroscope's mean over the rests of this recording, for filters that do not estimate it.
+    progress : callable (done, total), optional
+
+    Raises
+    ------
+    InputError
+        No gyroscope, raw counts without calibration, a unit that the calibration does not take, or a package missing.
+    DataError
+        Sensors that have no time in common.
+    UsageError
+        A filter or frame that does not exist.
+    """
+    chosen = find_filter(filter)
+    if frame not in FRAMES:
+        raise UsageError(f"there is no frame {frame!r}; choose one of {', '.join(FRAMES)}")
+    issues = list(recording.issues)
+    streams, late = si_streams(recording, calibration, issues)
+    _check_sensors(recording, streams, chosen, q0, mag)
+    if not mag:
+        streams.pop("mag", None)
+    late = delays_to_correct(delays, streams, late, recording.source, issues)
+    samples = one_clock(streams, late, recording.source, issues)
+    rests = find_rests(samples.t, samples.gyr, samples.acc)
+    bias = _bias(rests, samples, chosen, gyro_bias, issues)
+    gyr = samples.gyr - bias
+    around = surroundings_of(samples.t, samples.acc, samples.mag, rests, issues)
+    from_enu = np.array(FRAMES[frame])
+    if q0 is not None:
+        given = np.asarray(q0, dtype=np.float64)
+        _check_quaternion(given)
+        q, sd = so3.quat_multiply(so3.quat_conjugate(from_enu), given), (0.02, 0.02, 0.02)
+    else:
+        q, sd = first_attitude(samples.t, samples.acc, samples.mag, rests, around, issues)
+    params = chosen.params(around)
+    dt = np.diff(samples.t, prepend=samples.t[0])
+    state = chosen.start(q, sd)
+    track = _run(chosen, params, state, dt, gyr, samples.acc, samples.mag, progress)
+    figures = _figures(track, samples, bias, late, around)
+    issues += _told(track, samples, "mag" in streams)
+    turned = _continuous(so3.quat_multiply(from_enu, track.q))
+    return Orientation(
+        Attitude(samples.t, turned, parent=f"earth ({frame})", child="node"),
+        track.variance,
+        track.flags,
+        chosen.name,
+        frame,
+        to_plain(params),
+        to_plain(track.state),
+        figures,
+        tuple(issues),
+    )
+
+
+def _check_sensors(
+    recording: Recording, streams: Mapping[Kind, Stream], chosen: Filter, q0: ArrayLike | None, mag: bool
+) -> None:
+    if "gyr" not in streams:
+        raise InputError(f"{recording.source}: holds no gyroscope, without which no attitude can be followed")
+    if "acc" not in streams and not (chosen.name == "gyro" and q0 is not None):
+        raise InputError(
+            f"{recording.source}: holds no accelerometer, which tells what is up; with --filter gyro and a start "
+            "attitude the gyroscope alone is integrated"
+        )
+
+
+def _check_quaternion(q: Array) -> None:
+    if q.shape != (4,) or not np.all(np.isfinite(q)) or abs(np.linalg.norm(q) - 1) > 0.05:
+        raise InputError("the attitude at the start is no unit quaternion (w, x, y, z)")
+
+
+# --- the filter ---------------------------------------------------------------------------------------
+
+
+def _bias(rests: Rests, samples: Samples, chosen: Filter, how: str, issues: list[Issue]) -> Array:
+    """Bias of the gyroscope (3,) rad/s from the rests, or zero."""
+    if how not in ("rest", "none"):
+        raise UsageError(f"gyro_bias {how!r} is neither rest nor none")
+    if how == "none" or chosen.own_bias:
+        return np.zeros(3)
+    if rests.gyr_bias is None:
+        text = (
+            "no rest to take the gyroscope's bias from, so it was left as it is: let the node lie for two seconds at "
+            "the start, or take --filter vqf, which estimates it in motion"
+        )
+        issues.append(Issue("no-rest", "warn", text, "gyr"))
+        return np.zeros(3)
+    size = math.degrees(float(np.linalg.norm(rests.gyr_bias)))
+    text = f"the gyroscope's mean over {rests.seconds:.3g} s of rest, {size:.2g} deg/s, was subtracted"
+    issues.append(Issue("gyro-bias", "note", text, "gyr", size))
+    return rests.gyr_bias
+
+
+def _run(
+    chosen: Filter,
+    params: Any,
+    state: Any,
+    dt: Array,
+    gyr: Array,
+    acc: Array,
+    mag: Array,
+    progress: Progress | None,
+) -> Track:
+    """The filter over all samples, in pieces where it can be paused, so that progress shows."""
+    n = len(dt)
+    if chosen.own_bias or n <= CHUNK:
+        return chosen.batch(params, state, dt, gyr, acc, mag)
+    parts: list[Track] = []
+    for a in range(0, n, CHUNK):
+        piece = slice(a, min(a + CHUNK, n))
+        parts.append(chosen.batch(params, state, dt[piece], gyr[piece], acc[piece], mag[piece]))
+        state = parts[-1].state
+        if progress is not None:
+            progress(piece.stop, n)
+    q, variance, flags = (np.concatenate([getattr(p, name) for p in parts]) for name in ("q", "variance", "flags"))
+    return Track(q, variance, flags, state)
+
+
+def _continuous(q: Array) -> Array:
+    """Quaternions with the sign that makes each the neighbour of the one before; the first has w >= 0."""
+    flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
+    sign = np.concatenate([[-1.0 if q[0, 0] < 0 else 1.0], flips])
+    return q * np.cumprod(sign)[:, None]
+
+
+# --- what to know of it -------------------------------------------------------------------------------
+
+
+def _figures(
+    track: Track, samples: Samples, bias: Array, late: Mapping[Kind, float], around: Surroundings
+) -> dict[str, Any]:
+    n = len(track.q)
+    last = track.variance[-1]
+    return {
+        "samples": n,
+        "seconds": float(samples.t[-1] - samples.t[0]),
+        "used": {"acc": float(np.mean(track.flags & ACC > 0)), "mag": float(np.mean(track.flags & MAG > 0))},
+        "gaps": int(np.count_nonzero(track.flags & GAP)),
+        "without_rate": int(np.count_nonzero(track.flags & NO_GYR)),
+        "gyro_bias_dps": np.degrees(bias).tolist(),
+        "delays_s": dict(late),
+        "gravity": around.gravity,
+        "field": around.field if np.isfinite(samples.mag).any() else None,
+        "dip_deg": math.degrees(around.dip) if np.isfinite(samples.mag).any() else None,
+        "end_sd_deg": None if np.isnan(last).any() else np.degrees(np.sqrt(last)).tolist(),
+    }
+
+
+def _told(track: Track, samples: Samples, has_mag: bool) -> list[Issue]:
+    """Issues of what happened on the way."""
+    issues = []
+    gap = np.flatnonzero(track.flags & GAP)
+    if len(gap):
+        step = np.diff(samples.t, prepend=samples.t[0])[gap]
+        text = (
+            f"{len(gap)} gap{'s' if len(gap) > 1 else ''} in the gyroscope, the longest {step.max():.3g} s: the "
+            "attitude is held across each, and the seconds after it are spent finding it again"
+        )
+        issues.append(Issue("gaps", "warn", text, "gyr", float(step.max())))
+    blind = _longest(samples.t, track.flags & NO_GYR > 0)
+    if blind > 0:
+        text = f"the rate is not known for up to {blind:.3g} s on end: the attitude is held and found again afterwards"
+        issues.append(Issue("no-rate", "warn", text, "gyr", blind))
+    if not has_mag:
+        text = "no magnetometer: the heading is relative to the start and drifts with the gyroscope"
+        issues.append(Issue("heading-drifts", "note", text, "mag"))
+    else:
+        issues += _told_of("mag", track, samples.t, MAG, "the heading is the gyroscope's meanwhile")
+    if np.isfinite(samples.acc).any():
+        issues += _told_of("acc", track, samples.t, ACC, "the tilt is the gyroscope's meanwhile")
+    return issues
+
+
+def _told_of(kind: Kind, track: Track, t: Array, bit: int, then: str) -> list[Issue]:
+    unused = track.flags & bit == 0
+    share, longest = float(np.mean(unused)), _longest(t, unused)
+    if share < 0.05 and longest < 2.0:
+        return []
+    text = (
+        f"the {NAMES[kind]} was not used in {100 * share:.2g} % of the samples, {longest:.3g} s on end at most "
+        f"(missing, or not the length or direction that it should have): {then}"
+    )
+    return [Issue(f"{kind}-not-used", "warn", text, kind, share, 0.05)]
+
+
+def _longest(t: Array, mask: Mask) -> float:
+    """Seconds of the longest run of True; a single sample counts for the step before it."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    first, last = edges[::2], edges[1::2] - 1
+    if not len(first):
+        return 0.0
+    return float(np.max(t[last] - t[np.maximum(first - 1, 0)]))

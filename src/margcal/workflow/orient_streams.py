@@ -1,0 +1,180 @@
+"""Readings for an orientation filter: SI units, ends of the range taken out, delays corrected, all on one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from margcal.core.errors import DataError, InputError, UsageError
+from margcal.core.types import Array, Calibration, Issue, Kind, Recording, Stream
+from margcal.core.units import SI_COLUMN, UNITS
+from margcal.workflow.lint_scale import clip_limits
+
+NAMES = {"acc": "accelerometer", "gyr": "gyroscope", "mag": "magnetometer"}
+
+LONGEST_GAP = 5.0
+"""Sampling periods of a sensor across which its readings are interpolated, as in `apply`."""
+
+DELAY_SE_S = 2e-3
+"""A delay that is known no better is not corrected."""
+
+DELAY_EXPLAINED = 0.5
+"""Share of the field's turning that the gyroscope must explain before a delay between the two means anything."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """All sensors at the gyroscope's times; NaN where one has nothing to say."""
+
+    t: Array
+    gyr: Array
+    acc: Array
+    mag: Array
+
+
+def si_streams(
+    recording: Recording, calibration: Calibration | None, issues: list[Issue]
+) -> tuple[dict[Kind, Stream], dict[Kind, float]]:
+    """Streams in SI units without readings at the end of their range, and the delays of the calibration file."""
+    models = {} if calibration is None else calibration.models
+    streams: dict[Kind, Stream] = {}
+    delays: dict[Kind, float] = {}
+    for kind, raw in recording.streams.items():
+        y = _without_clipped(raw, recording.source, issues)
+        model = models.get(kind)
+        if model is not None:
+            if raw.unit != model.raw_unit:
+                raise InputError(
+                    f"{recording.source}: {kind} is in {raw.unit}, the calibration takes {model.raw_unit}; give the "
+                    "recording that it fits, or no calibration if this one is calibrated already"
+                )
+            streams[kind] = Stream(kind, raw.t, model.apply(y), SI_COLUMN[model.unit])
+            delays[kind] = model.delay_s or 0.0
+            continue
+        factor = 1.0 if raw.unit == "norm" else UNITS[kind].get(raw.unit)
+        if factor is None:
+            what = "there is no calibration" if calibration is None else "the calibration does not hold it"
+            raise InputError(
+                f"{recording.source}: the {NAMES[kind]} is in {raw.unit} and {what}: calibrate the node first (margcal "
+                "calibrate), or name the unit if the readings have one (--units)"
+            )
+        if calibration is not None:
+            text = f"{recording.source}: the {NAMES[kind]} is not in the calibration; taken as it is"
+            issues.append(Issue("not-calibrated", "warn", text, kind))
+        streams[kind] = Stream(kind, raw.t, y * factor, "norm" if raw.unit == "norm" else "")
+    return streams, delays
+
+
+def _without_clipped(stream: Stream, source: str, issues: list[Issue]) -> Array:
+    """Readings with NaN where an axis stands at the end of its range."""
+    low, high = clip_limits(stream)
+    if not (np.isfinite(low).any() or np.isfinite(high).any()):
+        return stream.y
+    with np.errstate(invalid="ignore"):
+        clipped = np.any((stream.y <= low) | (stream.y >= high), axis=1)
+    count = int(clipped.sum())
+    if not count:
+        return stream.y
+    text = (
+        f"{source}: {count} readings of the {NAMES[stream.kind]} are at the end of its range and were taken as not "
+        "measured; set a larger range, or move more slowly"
+    )
+    issues.append(Issue("saturated", "warn", text, stream.kind, count / len(clipped)))
+    return np.where(clipped[:, None], np.nan, stream.y)
+
+
+def delays_to_correct(
+    how: str, streams: Mapping[Kind, Stream], file: dict[Kind, float], source: str, issues: list[Issue]
+) -> dict[Kind, float]:
+    """Delay by sensor that is to be corrected, s."""
+    if how not in ("file", "estimate", "none"):
+        raise UsageError(f"delays {how!r} is none of file, estimate, none")
+    if how == "none":
+        return {}
+    late: dict[Kind, float] = {k: d for k, d in file.items() if d and k in streams}
+    if how == "file" or "mag" not in streams:
+        return late
+    found = _magnetometer_delay(streams["mag"], streams["gyr"], source, issues)
+    if found is not None:
+        late["mag"] = late.get("gyr", 0.0) + found
+    return late
+
+
+def _magnetometer_delay(mag: Stream, gyr: Stream, source: str, issues: list[Issue]) -> float | None:
+    """How far the magnetometer is behind the gyroscope, by following the field with the gyroscope (`methods.rates`)."""
+    from margcal.methods.rates import relate
+
+    good_m, good_g = np.isfinite(mag.y).all(axis=1), np.isfinite(gyr.y).all(axis=1)
+    length = float(np.median(np.linalg.norm(mag.y[good_m], axis=1))) if good_m.any() else 0.0
+    why = "the field does not turn"
+    if length > 0:
+        try:
+            found = relate(mag.t[good_m], mag.y[good_m] / length, gyr.t[good_g], gyr.y[good_g])
+        except DataError as error:
+            why = str(error)
+        else:
+            if found.delay_se_s <= DELAY_SE_S and found.explained >= DELAY_EXPLAINED:
+                text = (
+                    f"{source}: the magnetometer is {1e3 * found.delay_s:.1f} +- {1e3 * found.delay_se_s:.1f} ms "
+                    "behind the gyroscope, told by the motion; corrected"
+                )
+                issues.append(Issue("mag-delay", "note", text, "mag", found.delay_s))
+                return found.delay_s
+            why = (
+                f"the motion tells it to {1e3 * found.delay_se_s:.1f} ms only, and the gyroscope explains "
+                f"{100 * found.explained:.0f} % of the field's turning"
+            )
+    text = f"{source}: the magnetometer's delay cannot be told from this recording ({why}); none was corrected"
+    issues.append(Issue("no-mag-delay", "warn", text, "mag"))
+    return None
+
+
+# --- one clock ----------------------------------------------------------------------------------------
+
+
+def one_clock(streams: Mapping[Kind, Stream], late: Mapping[Kind, float], source: str, issues: list[Issue]) -> Samples:
+    t = streams["gyr"].t
+    at: dict[Kind, Array] = {}
+    for kind in ("gyr", "acc", "mag"):
+        stream = streams.get(kind)
+        at[kind] = np.full((len(t), 3), np.nan) if stream is None else _at(t, stream, late.get(kind, 0.0))
+        if stream is not None and not np.isfinite(at[kind][:, 0]).any():
+            raise DataError(
+                f"{source}: the {NAMES[kind]} has no usable reading in the time of the gyroscope; check the clocks of "
+                "the tables, they must share an origin",
+                (Issue("no-overlap", "fail", f"{NAMES[kind]}: no reading in the time of the gyroscope", kind),),
+            )
+    for kind in streams:
+        share = 1 - float(np.isfinite(at[kind]).all(axis=1).mean())
+        if share > 0.01:
+            text = (
+                f"{source}: the {NAMES[kind]} has nothing to say in {100 * share:.2g} % of the samples (gaps, missing "
+                "or clipped readings, no time in common)"
+            )
+            issues.append(Issue("missing-readings", "warn", text, kind, share, 0.01))
+    return Samples(t, at["gyr"], at["acc"], at["mag"])
+
+
+def _at(t: Array, stream: Stream, delay: float) -> Array:
+    """Readings (N, 3) at times `t`: interpolated, NaN beyond the ends and in gaps."""
+    if delay == 0.0 and (stream.t is t or np.array_equal(stream.t, t)):
+        return stream.y
+    good = np.isfinite(stream.y).all(axis=1)
+    clock, y = stream.t[good], stream.y[good]
+    out = np.full((len(t), 3), np.nan)
+    if len(clock) < 2:
+        return out
+    when = t + delay
+    after = np.clip(np.searchsorted(clock, when), 1, len(clock) - 1)
+    step = clock[after] - clock[after - 1]
+    known = (when >= clock[0]) & (when <= clock[-1]) & (step <= LONGEST_GAP * _usual(np.diff(clock)))
+    for k in range(3):
+        out[known, k] = np.interp(when[known], clock, y[:, k])
+    return out
+
+
+def _usual(step: Array) -> float:
+    """Upper median."""
+    return float(np.partition(step, len(step) // 2)[len(step) // 2])
