@@ -3,8 +3,8 @@
     python benchmarks/bench_lad.py [--json]
 
 One right-hand side of R-BSN (20): calibrated readings on raw ones and a constant, Laplacian noise. Ratios count: the
-three run one after the other in one process on one thread. The gap is held against HiGHS' cost (dual simplex with
-feasibility 1e-10); Clarabel's own is shown beside it.
+three run one after the other in one process on one thread. The gap is held against HiGHS' cost (dual simplex on the
+dual, feasibility 1e-10); Clarabel's own is shown beside it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from scipy import sparse
 from scipy.optimize import linprog
 
 from margcal.core.lad import least_absolute
@@ -46,14 +45,12 @@ def timed(function: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 
 def highs(A: np.ndarray, b: np.ndarray) -> float:
-    n, p = A.shape
-    rows = sparse.hstack([sparse.csr_matrix(A), -sparse.eye(n), sparse.eye(n)]).tocsc()
-    cost = np.concatenate([np.zeros(p), np.ones(2 * n)])
+    """Optimal cost, from the dual: the largest ``-b^T y`` with ``A^T y = 0`` and ``|y| <= 1``. HiGHS solves it in
+    seconds, the primal with its 2e5 slacks in minutes."""
     tight = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-    found = linprog(
-        cost, A_eq=rows, b_eq=b, bounds=[(None, None)] * p + [(0, None)] * 2 * n, method="highs-ds", options=tight
-    )
-    return float(np.abs(A @ found.x[:p] - b).sum())
+    found = linprog(b, A_eq=A.T, b_eq=np.zeros(A.shape[1]), bounds=(-1, 1), method="highs-ds", options=tight)
+    # a vertex: the multipliers are x, whose cost is compared
+    return float(np.abs(A @ found.eqlin.marginals - b).sum())
 
 
 def clarabel(A: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -87,9 +84,8 @@ def main() -> int:
         print(json.dumps(result, indent=2))
         return 0
     print(f"ours       {result['ours_ms']:9.0f} ms CPU, {result['pivots']} pivots, gap {result['own_gap']:.1e}")
-    print(
-        f"Clarabel   {result['clarabel_ms']:9.0f} ms CPU, {result['ratio_clarabel']:.0f} times ours (>= {TARGET_RATIO:g})"
-    )
+    times = result["ratio_clarabel"]
+    print(f"Clarabel   {result['clarabel_ms']:9.0f} ms CPU, {times:.0f} times ours (>= {TARGET_RATIO:g})")
     print(f"HiGHS      {result['highs_ms']:9.0f} ms CPU, {result['ratio_highs']:.0f} times ours")
     print(
         f"cost against HiGHS': ours {result['gap_to_highs']:+.1e} (<= {TARGET_GAP:g}), "

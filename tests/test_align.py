@@ -278,3 +278,19 @@ def test_verb_refuses_with_reasons(sim: MocapSimulation, tmp_path: Path, capsys:
     assert "as printed" in capsys.readouterr().err
     assert margcal(["align", node, "--reference", node, "-o", cal]) == 1
     assert "no reference" in capsys.readouterr().err
+
+
+# --- without optics -------------------------------------------------------------------------------------
+
+
+def test_calibrate_keeps_the_magnetometers_delay() -> None:
+    """A session of rests and turns whose magnetometer is 11 ms late: the file says so, and `apply` takes it out."""
+    from margcal.workflow.calibrate import calibrate
+    from margcal.workflow.simulate import simulate
+
+    made = simulate(seed=1).recording
+    mag = made.streams["mag"]
+    on_time = calibrate(made).models["mag"]
+    late = calibrate(replace(made, mag=replace(mag, t=mag.t + 0.011))).models["mag"]
+    assert on_time.delay_s is None
+    assert late.delay_s == pytest.approx(0.011, abs=4 * (late.delay_se_s or 0))

@@ -462,6 +462,20 @@ def test_nothing_to_read(tmp_path):
         read_reference(tmp_path / "a.csv", rate=0.0)
 
 
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("Format Version,1.23,Take Name,walk\n\n,Type,Rigid Body\n", "Motive export.* X, Y, Z, W"),
+        ("NO_OF_FRAMES\t6000\nFREQUENCY\t100\n", "Qualisys TSV.* column by column"),
+        ("PathFileType\t4\t(X/Y/Z)\twalk.trc\n", "TRC file"),
+    ],
+)
+def test_exports_of_motion_capture_programs_are_named(tmp_path, content, words):
+    (tmp_path / "walk.csv").write_text(content)
+    with pytest.raises(InputError, match=words):
+        read_reference(tmp_path / "walk.csv")
+
+
 # --- real feet ----------------------------------------------------------------------------------------
 
 

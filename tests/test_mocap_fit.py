@@ -425,3 +425,23 @@ def test_broad_12_is_refused_or_widened(data_file: Callable[[str], Path]) -> Non
     off, sd = gyr.model.H - np.eye(3), np.sqrt(np.diag(gyr.covariance)[:9]).reshape(3, 3)
     assert sd.max() > 0.01
     assert np.all(np.abs(off) < 3 * sd + 0.005)
+
+
+def test_broad_21_without_positions_is_refused_and_with_them_within_one_per_cent(
+    data_file: Callable[[str], Path],
+) -> None:
+    """Fast turns and accelerations that go with them: low frequencies alone cannot tell, and must not pretend to."""
+    data, reference = broad(data_file("broad/21_undisturbed_fast_combined.parquet"))
+    t = data["t"] - 0.0045
+    R = attitude_at(reference, t)
+    with pytest.raises(DataError, match="least determined"):
+        mocap_fit.lowpass_svd(t, data["acc"], R, seen(R))
+    widened = mocap_fit.lowpass_svd(t, data["acc"], R, seen(R), gate=False)
+    assert mocap_fit.CROWDED in widened.text
+    assert widened.covariance is not None
+    off, sd = widened.model.H - np.eye(3), np.sqrt(np.diag(widened.covariance)[:9]).reshape(3, 3)
+    assert np.abs(off).max() > 0.05
+    assert np.all(np.abs(off) < 3 * sd)
+    assert reference.p is not None
+    acc = mocap_fit.forward(t, data["acc"], R, resample(reference.t, reference.p, t), seen(R))
+    assert np.abs(so3.polar(acc.model.H)[1] - np.eye(3)).max() < 0.01

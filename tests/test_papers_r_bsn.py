@@ -16,13 +16,13 @@ import pytest
 from margcal.apps import cli
 from margcal.apps.papers import r_bsn, r_bsn_runs
 from margcal.apps.papers.r_bsn_runs import OURS, PAPER, PERFECT, UNCALIBRATED
-from margcal.apps.papers.r_bsn_simulation import Node, Setting, session
+from margcal.apps.papers.r_bsn_simulation import Node, Session, Setting, session
 from margcal.core import so3
 from margcal.core.rigid_body import MarkerReference
 from margcal.core.types import Alignment
 from margcal.workflow.gait import PLACES
 
-SHORT = Setting(still_s=(0.0, 6.0), moved_s=(10.0, 40.0), walk_s=(45.0, 67.0))
+SHORT = Setting(still_s=(0.0, 6.0), moved_s=(10.0, 40.0), walk_s=(45.0, 65.0))
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,19 @@ def plain(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def node() -> Node:
-    return session(3, SHORT).nodes["thigh"]
+def first() -> Session:
+    return session(3, SHORT)
+
+
+@pytest.fixture(scope="module")
+def turned() -> Session:
+    """The same, had the wand lain otherwise."""
+    return session(3, SHORT, yaw_deg=40.0)
+
+
+@pytest.fixture(scope="module")
+def node(first: Session) -> Node:
+    return first.nodes["thigh"]
 
 
 def grid(plain: dict[str, Any], name: str) -> dict[str, dict[str, float]]:
@@ -85,12 +96,13 @@ def test_readings_are_what_the_truth_makes_of_the_references(node: Node):
         assert np.abs(np.mean((seen - truth)[good], axis=0)).max() < 0.05 * limit
 
 
-def test_same_seed_same_session_and_the_yaw_changes_the_laboratory_only(node: Node):
-    again, turned = session(3, SHORT).nodes["thigh"], session(3, SHORT, yaw_deg=40.0).nodes["thigh"]
-    for other in (again, turned):
-        np.testing.assert_array_equal(other.walk.recording.streams["mag"].y, node.walk.recording.streams["mag"].y)
-    np.testing.assert_array_equal(again.walk.reference.q, node.walk.reference.q)
-    assert np.degrees(so3.angle_between(turned.R_nm, so3.exp([0, 0, np.radians(40.0)]))) < 1.5
+def test_same_seed_same_session_and_the_yaw_changes_the_laboratory_only(first: Session, turned: Session):
+    for place in PLACES:
+        one, other = first.nodes[place], turned.nodes[place]
+        for trial, same in ((one.walk, other.walk), (one.moved, other.moved)):
+            np.testing.assert_array_equal(trial.recording.streams["mag"].y, same.recording.streams["mag"].y)
+        turn = one.R_nm.T @ other.R_nm
+        assert np.degrees(so3.angle_between(turn, np.eye(3))) == pytest.approx(40.0 - first.yaw_deg)
 
 
 def test_nodes_without_errors_have_none():
@@ -122,15 +134,14 @@ def test_the_true_calibration_is_as_good_as_perfect_sensors(node: Node):
         assert abs(of(walks["true"]).total_deg - of(walks[PERFECT]).total_deg) < 0.35
 
 
-def test_another_yaw_of_the_wand_changes_the_uncalibrated_error_alone():
-    first, other = session(5, SHORT), session(5, SHORT, yaw_deg=12.0)
+def test_another_yaw_of_the_wand_changes_the_uncalibrated_error_alone(first: Session, turned: Session):
     found = []
-    for one in (first, other):
+    for one in (first, turned):
         node = one.nodes["hip"]
         jobs = [*r_bsn_runs._as_they_are(0, node, SHORT)]
         q = r_bsn_runs._filtered([j.recording for j in jobs])
         found.append({j.variant: r_bsn_runs._judged(j, a).evaluation for j, a in zip(jobs, q)})
-    told = r_bsn_runs.with_yaw(found[0][UNCALIBRATED], first, 12.0)
+    told = r_bsn_runs.with_yaw(found[0][UNCALIBRATED], first, 40.0)
     assert told == pytest.approx(found[1][UNCALIBRATED].total_deg, abs=0.02)
     assert abs(told - found[0][UNCALIBRATED].total_deg) > 0.5
     assert found[0][PERFECT].total_deg == pytest.approx(found[1][PERFECT].total_deg, abs=0.02)
@@ -141,10 +152,11 @@ def test_another_yaw_of_the_wand_changes_the_uncalibrated_error_alone():
 
 def test_calibration_takes_off_what_the_frames_and_the_nodes_cost(plain: dict[str, Any]):
     errors, by_vqf = grid(plain, "errors"), grid(plain, "vqf")
+    for way in (PAPER, OURS):
+        assert errors[f"hip, {way}"]["total"] < 0.5 * errors[f"hip, {UNCALIBRATED}"]["total"]
+        for place in PLACES:
+            assert by_vqf[place][way] < 0.5 * by_vqf[place][UNCALIBRATED]
     for place in PLACES:
-        for way in (PAPER, OURS):
-            assert errors[f"{place}, {way}"]["total"] < 0.8 * errors[f"{place}, {UNCALIBRATED}"]["total"]
-            assert by_vqf[place][way] < 0.4 * by_vqf[place][UNCALIBRATED]
         assert by_vqf[place][OURS] < by_vqf[place][PERFECT] + 0.3
     # what is left at the ankle is the filter's: perfect sensors do no better
     assert abs(errors[f"ankle, {PAPER}"]["total"] - errors[f"ankle, {PERFECT}"]["total"]) < 2
@@ -194,6 +206,6 @@ def test_command_shows_what_it_writes(folder: Path, plain: dict[str, Any]):
 
 
 def test_same_seed_same_alignment(node: Node):
-    first, second = (r_bsn_runs.aligned(session(3, SHORT).nodes["thigh"], "r-bsn") for _ in range(2))
+    first, second = (r_bsn_runs.aligned(n, "r-bsn") for n in (node, session(3, SHORT).nodes["thigh"]))
     assert first is not None and second is not None
     assert r_bsn_runs.accuracy_of(node, first) == r_bsn_runs.accuracy_of(node, second)

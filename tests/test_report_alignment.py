@@ -197,6 +197,12 @@ def test_a_turn_in_words(turn: list[float], words: str) -> None:
     assert words in _text(turned(so3.exp(turn), "marker body", "node"))
 
 
+def test_a_turn_within_its_error_has_no_axis() -> None:
+    R, se = so3.exp([0.0, 0.0, np.radians(0.2)]), np.radians([0.1, 0.1, 0.1])
+    assert "0.20° against the node; with a standard error of 0.17°" in _text(turned(R, "marker body", "node", se))
+    assert "about its +z axis" in _text(turned(R, "marker body", "node", se / 3))
+
+
 def test_laboratories_of_all_kinds_in_words() -> None:
     east_of_north = so3.exp([0.0, 0.0, -np.radians(30.0)])  # y of the laboratory 30 degrees clockwise from north
     assert "+z axis points up, exactly along the vertical; its +y axis points 30° east" in _text(

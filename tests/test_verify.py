@@ -70,7 +70,7 @@ def node() -> Simulation:
 
 @pytest.mark.parametrize("mistake", FIVE)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_each_mistake_is_named_from_rests_and_turns(mistake, seed):
+def test_each_mistake_is_named_from_rests_and_turns(mistake: str, seed: int):
     made = typical(seed)
     for wrong in (dict.fromkeys(KINDS, mistake), {KINDS[(seed + len(mistake)) % 3]: mistake}):
         found = verify(made.truth, applied(made.truth, made.recording, wrong))
@@ -205,9 +205,12 @@ def test_what_cannot_be_verified_is_refused(node):
     right = applied(truth, raw)
     with pytest.raises(InputError, match="mag is in uT, the calibration takes count"):
         verify(truth, Recording(mag=right.mag), Recording(mag=right.mag))
-    with pytest.raises(InputError, match="holds acc, the calibration is of mag"):
+    with pytest.raises(InputError, match="readings of acc, the calibration is of mag"):
         verify(Calibration(mag=truth.mag), Recording(acc=right.acc))
     assert right.acc is not None
+    empty = replace(right.acc, y=np.full_like(right.acc.y, np.nan))
+    with pytest.raises(InputError, match="calibrated node"):
+        verify(truth, Recording(acc=empty))
     later = Recording(acc=replace(right.acc, t=right.acc.t + 1e4))
     with pytest.raises(DataError, match="0 samples have a raw partner"):
         verify(truth, later, raw)

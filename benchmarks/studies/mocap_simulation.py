@@ -3,9 +3,9 @@
     python benchmarks/studies/mocap_simulation.py [--seeds 8] [--duration 60] [-o FILE]
 
 Node at 75 Hz, cameras at 100 Hz (0.2 mm, 0.1 degree), 60 s, raw counts, 6 % scale errors, 2 % cross terms, rotation
-about all axes, linear acceleration of 0, 0.5, 1.5 and 3 m/s^2 rms. Errors are those of the calibrated vector over the sphere
-(root mean square, of H and B together) in per cent of its length, and of H alone and B alone; in degrees those of the
-frames. `sigma` is the rms of errors over standard errors, `nees` the mean of the normalised squared error.
+about all axes, linear acceleration of 0, 0.5, 1.5 and 3 m/s^2 rms. Errors are those of the calibrated vector over the
+sphere (root mean square, of H and B together) in per cent of its length, and of H alone and B alone; in degrees those
+of the frames. `sigma` is the rms of errors over standard errors, `nees` the mean of the normalised squared error.
 """
 
 from __future__ import annotations

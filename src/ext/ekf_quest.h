@@ -134,11 +134,12 @@ public:
         out.q[2] = select(both, z.y, zero);
         out.q[3] = select(both, z.z, zero);
         out.tilt_only = has_acc & no(both);
-        out.R_w = select(seen, rate_variance_ * density, never);
+        const Bool<Real> gap = dt > gap_;  // a reading after a gap is no mean rate over it
+        out.R_w = select(seen & no(gap), rate_variance_ * density, never);
         out.R_q = select(both, R, never);
         out.R_up = select(out.tilt_only, R, never);
         out.flags = when<Real>(has_acc, FLAG_ACC) + when<Real>(both, FLAG_MAG) + when<Real>(no(seen), FLAG_NO_GYR) +
-                    when<Real>(dt > gap_, FLAG_GAP);
+                    when<Real>(gap, FLAG_GAP);
     }
 
 private:

@@ -80,9 +80,8 @@ private:
         const Real scale = select(use, length / gravity_, one);
         for (Real& x : b) x = x * scale;
         to_earth(q_, b, f);
-        const Real half = 0.5 * (1.0 + f[2]);
         Real theta[3] = {zero, zero, zero};
-        const Real first[3] = {zero, half, -0.5 * f[1]}, second[3] = {-half, zero, 0.5 * f[0]};
+        const Real first[3] = {zero, one, zero}, second[3] = {-one, zero, zero};
         correct(theta, f[0], first, R);   // (v)
         correct(theta, f[1], second, R);  // (vi)
         turn(theta);

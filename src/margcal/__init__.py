@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from margcal.workflow.align import align
     from margcal.workflow.calibrate import calibrate
     from margcal.workflow.evaluate import evaluate
+    from margcal.workflow.orient import orient
     from margcal.workflow.segment import find_poses
     from margcal.workflow.simulate import simulate
     from margcal.workflow.verify import verify
@@ -81,6 +82,7 @@ __all__ = [
     "evaluate",
     "verify",
     "simulate",
+    "orient",
     "MargcalError",
     "InputError",
     "UsageError",
@@ -109,6 +111,7 @@ _HOME = {
     "evaluate": "workflow.evaluate",
     "verify": "workflow.verify",
     "simulate": "workflow.simulate",
+    "orient": "workflow.orient",
     "MargcalError": "core.errors",
     "InputError": "core.errors",
     "UsageError": "core.errors",

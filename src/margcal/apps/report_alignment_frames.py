@@ -39,9 +39,9 @@ def frames(values: Mapping[str, Any]) -> str:
     lever = vector(values.get("lever_arm_m"), largest=LONGEST_M)
     parts = []
     if node is not None or lever is not None:
-        parts.append(_node_figure(node, lever, vector(values.get("lever_arm_m_se"))))
+        parts.append(_node_figure(node, lever, values))
     if earth is not None:
-        parts.append(_earth_figure(earth))
+        parts.append(_earth_figure(earth, values))
     return "".join(parts) + _figures(values, node, earth) if parts else ""
 
 
@@ -65,10 +65,19 @@ def vector(values: Any, n: int = 3, largest: float = math.inf) -> Array | None:
 # --- words ---------------------------------------------------------------------------------------------
 
 
-def turned(R: Array, one: str, other: str) -> str:
-    """``The marker body is turned by 20.9° against the node, about the direction ... of the node's axes`` (HTML)."""
+def turned(R: Array, one: str, other: str, se: Array | None = None) -> str:
+    """``The marker body is turned by 20.9° against the node, about the direction ... of the node's axes`` (HTML).
+
+    `se` (3,), rad: an angle within twice that is told as such, and without an axis.
+    """
     turn = so3.log(R)
     angle = float(np.linalg.norm(turn))
+    error = 0.0 if se is None else float(np.linalg.norm(se))
+    if angle < 2 * error:
+        return (
+            f"The {one} is turned by <strong>{degrees(math.degrees(angle))}</strong> against the {other}; with a "
+            f"standard error of {degrees(math.degrees(error))}, that is not to be told from parallel"
+        )
     if math.degrees(angle) < SAME_DEG:
         return f"The {one} lies <strong>parallel</strong> to the {other}"
     axis = turn / angle
@@ -115,7 +124,7 @@ def lever_words(lever: Array, se: Array | None) -> str:
 # --- figures -------------------------------------------------------------------------------------------
 
 
-def _node_figure(R_hk: Array | None, lever: Array | None, se: Array | None) -> str:
+def _node_figure(R_hk: Array | None, lever: Array | None, values: Mapping[str, Any]) -> str:
     """Node, marker body and lever arm; columns of R_hk are the marker body's axes in the node's."""
     words, pictures, low = [], [], 0.0
     if R_hk is not None:
@@ -124,16 +133,20 @@ def _node_figure(R_hk: Array | None, lever: Array | None, se: Array | None) -> s
         low = min(low, float(_drawn(lever)[2]))
     tall = _height(low)
     if R_hk is not None:
-        words.append(f"{turned(R_hk, 'marker body', 'node')}. Dashed beside the marker body's axes: the node's.")
+        words.append(f"{turned(R_hk, 'marker body', 'node', vector(values.get('marker_to_node_se')))}.")
+        words.append("Dashed beside the marker body's axes: the node's.")
         pictures += [_triad("Node", np.eye(3), AXES, tall), _triad("Marker body", R_hk, AXES, tall, ghost=True)]
     if lever is not None:
-        words.append(f"{lever_words(lever, se)}.")
+        words.append(f"{lever_words(lever, vector(values.get('lever_arm_m_se')))}.")
         pictures.append(_lever(lever, tall))
     return _figure("Node and marker body", words, pictures)
 
 
-def _earth_figure(R_nm: Array) -> str:
-    words = [f"{turned(R_nm, 'laboratory', 'earth')}.", f"{heading_words(R_nm)}. Dashed: the earth's axes."]
+def _earth_figure(R_nm: Array, values: Mapping[str, Any]) -> str:
+    words = [
+        f"{turned(R_nm, 'laboratory', 'earth', vector(values.get('lab_to_earth_se')))}.",
+        f"{heading_words(R_nm)}. Dashed: the earth's axes.",
+    ]
     tall = _height(float(R_nm[2].min()))
     pictures = [_triad("Earth", np.eye(3), EARTH, tall), _triad("Laboratory", R_nm, AXES, tall, ghost=True)]
     return _figure("Laboratory and earth", words, pictures)

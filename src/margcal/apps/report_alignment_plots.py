@@ -69,8 +69,8 @@ def correlation_figure(figures: AlignFigures, at: float, common_clock: bool) -> 
         ground,
         axis_below(across, height),
         f'<line class="rms" x1="0" x2="100%" y1="{level:.1f}" y2="{level:.1f}"/>',
-        _taken(float(across(at)), top, f"{fixed(1e3 * at, 2)} ms"),
         curve,
+        _taken(float(across(at)), top, f"{fixed(1e3 * at, 2)} ms"),
         f'<text class="panel-name" x="0" y="{top - 9:g}">Correlation against the {what}</text>',
     ]
     title = f"Correlation of the angular rates against the {what}; highest, {figures.peak:.3f}, at {1e3 * at:.2f} ms"

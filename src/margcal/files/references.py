@@ -66,6 +66,7 @@ def read_reference(
     if path.suffix.lower() == ".c3d":
         tracks = read_markers(path, unit=unit, max_bytes=max_bytes)
         return marker_reference(tracks, names=markers, template=template)
+    _refuse_exports(path)
     table = open_table(path)
     if want_markers or _kind(table) == "markers":
         tracks = markers_of(table, unit=unit, rate=rate, max_bytes=max_bytes)
@@ -73,6 +74,28 @@ def read_reference(
     if table.size > max_bytes:
         raise InputError(f"{table.file}: {table.size / 1e9:.1f} GB is more than is read into memory; cut it")
     return _quaternions(table, rate)
+
+
+_EXPORTS = {
+    b"Format Version,": "an OptiTrack Motive export: export C3D, or make a table t_s, qw, qx, qy, qz of its columns "
+    "(Motive writes the quaternion X, Y, Z, W, y is up, and the units are in the header)",
+    b"NO_OF_FRAMES": "a Qualisys TSV export: export C3D, or make a table t_s, qw, qx, qy, qz of its 6D columns "
+    "(Rot[0] to Rot[8] hold the matrix column by column, lengths are mm)",
+    b"PathFileType": "a TRC file: export C3D, or make a table t_s, name_x_mm, name_y_mm, name_z_mm of its columns",
+}
+"""How exports of motion-capture programs begin that are no table of ours, and what to do."""
+
+
+def _refuse_exports(path: Path) -> None:
+    """Refuse what would be read as a table with odd columns."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(32).removeprefix(b"\xef\xbb\xbf")
+    except OSError:
+        return  # `open_table` says why
+    for begin, what in _EXPORTS.items():
+        if head.startswith(begin):
+            raise InputError(f"{printable(path.name)}: this is {what}")
 
 
 def _kind(table: Table) -> str | None:

@@ -30,6 +30,8 @@ STEP_S = 0.002
 """Half step of a derivative by time."""
 REACH_S = 0.018
 """Delays up to this far from the gyroscope's are looked for by their cost."""
+FLOOR_S = 3e-4
+"""What the low-pass leaves of a bias in such a delay, measured in simulation over ten minutes."""
 FARTHEST_S = 0.05
 """Longest step of d in one round."""
 SETTLED_S = 1e-5
@@ -175,7 +177,7 @@ def delay_of_lowest(cost: Callable[[float], float], *, start: float, freedom: fl
     if not bend > 0:
         return SensorDelay(best, float("inf"), 0.0)
     d = best - float(np.clip((high - low) / (2 * step) / bend, -step, step))
-    se = float(np.sqrt(2 * middle / max(freedom, 1.0) / bend))
+    se = float(np.hypot(np.sqrt(2 * middle / max(freedom, 1.0) / bend), FLOOR_S))
     return SensorDelay(float(d), se, 1 - middle / max(tried[start], 1e-300))
 
 

@@ -32,7 +32,8 @@ Not in the paper, and marked in the code:
 - QUEST's quaternion is taken with the sign of the prediction, and its variance is divided by the length of the
   specific force: its tilt times that length is linear in the acceleration, and a hand's acceleration averages to zero;
 - where the field is not as long as it should be, or is not measured, the tilt alone is taken;
-- a gap needs no rule of its own: over a long step (7) forgets the rate and the covariance grows by itself.
+- after a gap the gyroscope is not taken once: (7) forgets the rate over a long step, and the covariance grows by
+  itself.
 """
 
 from __future__ import annotations
@@ -95,8 +96,8 @@ class Params(NamedTuple):
     `tau` and `D` are a hand's and hardly matter beside a gyroscope. `rate_noise` is reckoned: a gyroscope that is off
     by 0.2 deg/s, or by 0.5 % of a quick turn, for a second. Its ratio to `quest_noise` is the time in which QUEST is
     believed, 33 s: it and the two settings of the magnetometer were chosen on the four motions of tyrex (phones,
-    Qualisys). There 0.06 and 0.1 are alike (2.3 degrees) where no magnet is near and 0.1 is better where one is; weights
-    of 1, 3 and 10 differ by 3 %; without the gate the error near magnets doubles.
+    Qualisys). There 0.06 and 0.1 are alike (2.3 degrees) where no magnet is near and 0.1 is better where one is;
+    weights of 1, 3 and 10 differ by 3 %; without the gate the error near magnets doubles.
     """
 
     gravity: float = STANDARD_GRAVITY
@@ -147,6 +148,7 @@ def batch(params: Params, state: State, dt: ArrayLike, gyr: ArrayLike, acc: Arra
     """
     gyr, acc, mag = as_samples(gyr, acc, mag)
     dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), gyr.shape[:-1])
+    # src/ext/ekf_quest.h is the same filter, line by line: change both
     found = compiled_track.run("ekf_quest", params, ((state.x, 1), (state.P, 2)), dt, gyr, acc, mag)
     if found is not None:
         return Track(*found[:3], State(*found.memory, found.flags[..., -1]))
@@ -184,7 +186,8 @@ def _advance(params: Params, state: State, dt: Array, gyr: Array, acc: Array, me
     seen = measured_rate(gyr)
     b, length, has_acc = unit_sample(acc)
     density = 1 / np.maximum(np.minimum(dt, params.gap), SHORTEST_STEP)  # not in the paper: densities
-    R_w = np.where(seen, params.rate_noise**2 * density, np.inf)
+    gap = dt > params.gap  # a reading after a gap is no mean rate over it
+    R_w = np.where(seen & ~gap, params.rate_noise**2 * density, np.inf)
     # not in the paper: the longer the specific force, the more its direction counts
     R_q = 0.25 * params.quest_noise**2 * density * params.gravity / np.where(has_acc, length, 1.0)
     z_w = np.where(seen[..., None], gyr, 0.0)
@@ -200,7 +203,7 @@ def _advance(params: Params, state: State, dt: Array, gyr: Array, acc: Array, me
         x, P = _correct_tilt(x, P, b, np.where(tilt_only, R_q, np.inf))
     x = x.copy()
     x[..., 3:] /= np.sqrt(np.sum(x[..., 3:] * x[..., 3:], axis=-1, keepdims=True))
-    flags = ACC * has_acc + MAG * both + NO_GYR * ~seen + GAP * (dt > params.gap)
+    flags = ACC * has_acc + MAG * both + NO_GYR * ~seen + GAP * gap
     return State(x, P, flags.astype(np.uint8))
 
 

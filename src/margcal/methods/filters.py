@@ -38,6 +38,8 @@ class Filter(NamedTuple):
     batch : callable (params, state, dt, gyr, acc, mag) -> Track
     own_bias : bool
         It estimates the gyroscope's bias by itself.
+    corrects : bool
+        It looks at accelerometer and magnetometer.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Filter(NamedTuple):
     step: Callable[..., Any] | None
     batch: Callable[..., Track]
     own_bias: bool = False
+    corrects: bool = True
 
 
 def _of_place(kind: Any) -> Callable[[Surroundings], Any]:
@@ -83,6 +86,7 @@ FILTERS: dict[str, Filter] = {
             strapdown.start,
             strapdown.step,
             strapdown.batch,
+            corrects=False,
         ),
         Filter(
             "vqf",

@@ -157,10 +157,10 @@ def _compiled_quat(y: ArrayLike, dt: ArrayLike, H: ArrayLike, B: ArrayLike) -> A
         return None
     H, B = np.asarray(H, dtype=np.float64), np.asarray(B, dtype=np.float64)
     samples = max(y.shape[-2], dt.shape[-1])
-    turns = np.broadcast_shapes(y.shape[:-2], dt.shape[:-1])
-    sensors = np.broadcast_shapes(H.shape[:-2], B.shape[:-1])
-    lead = np.broadcast_shapes(turns, sensors)
-    out = np.empty((*lead, 4))
+    turns = _common(y.shape[:-2], dt.shape[:-1])
+    sensors = _common(H.shape[:-2], B.shape[:-1])
+    lead = _common(turns, sensors)
+    out = np.empty((math.prod(lead), 4))
     kernels.integrate(
         _flat(y, turns, (samples, 3)),
         _flat(dt, turns, (samples,)),
@@ -168,23 +168,33 @@ def _compiled_quat(y: ArrayLike, dt: ArrayLike, H: ArrayLike, B: ArrayLike) -> A
         _flat(B, sensors, (3,)),
         _index(turns, lead),
         _index(sensors, lead),
-        out.reshape(-1, 4),
+        out,
     )
-    return out
+    return out.reshape(*lead, 4)
+
+
+def _common(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
+    """`np.broadcast_shapes`, quick where there is nothing to do: it costs as much as a turn."""
+    return a if a == b or not b else b if not a else np.broadcast_shapes(a, b)
 
 
 def _flat(a: Array, lead: tuple[int, ...], tail: tuple[int, ...]) -> Array:
     """`a` broadcast to leading axes `lead`, those as one, in contiguous memory."""
-    if a.shape != (*lead, *tail):
-        a = np.broadcast_to(a, (*lead, *tail))
-    return np.ascontiguousarray(a.reshape(-1, *tail))
+    shape = (*lead, *tail)
+    if a.shape != shape:
+        wide = np.empty(shape)
+        wide[...] = a
+        a = wide
+    return np.ascontiguousarray(a).reshape(math.prod(lead), *tail)
 
 
 def _index(own: tuple[int, ...], lead: tuple[int, ...]) -> Index:
     """For each element of shape `lead` the flat index of the element of shape `own` that broadcasts to it."""
-    count = math.prod(own)
-    if own == lead:
+    count, wanted = math.prod(own), math.prod(lead)
+    if count == wanted:
         return np.arange(count)
+    if count == 1:
+        return np.zeros(wanted, dtype=np.int64)
     return np.broadcast_to(np.arange(count).reshape(own), lead).ravel()
 
 

@@ -70,6 +70,7 @@ def batch(params: Params, state: State, dt: ArrayLike, gyr: ArrayLike, acc: Arra
     """All samples of a recording, or of many nodes side by side; arguments as in `tracking`."""
     (gyr,) = as_samples(gyr)
     dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), gyr.shape[:-1])
+    # src/ext/strapdown.h is the same filter, line by line: change both
     found = compiled_track.run("strapdown", params, ((state.q, 1), (state.variance, 1)), dt, gyr, acc, mag)
     if found is not None:
         return Track(*found[:3], State(*found.memory, found.flags[..., -1]))

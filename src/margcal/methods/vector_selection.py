@@ -162,6 +162,7 @@ def batch(params: Params, state: State, dt: ArrayLike, gyr: ArrayLike, acc: Arra
     """
     gyr, acc, mag = as_samples(gyr, acc, mag)
     dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), gyr.shape[:-1])
+    # src/ext/selection.h is the same filter, line by line: change both
     found = compiled_track.run("vector_selection", params, ((state.q, 1), (state.P, 2)), dt, gyr, acc, mag)
     if found is not None:
         return Track(*found[:3], State(*found.memory, found.flags[..., -1]))

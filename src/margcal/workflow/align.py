@@ -2,7 +2,7 @@
 
 1. `clean_reference` masks what the optics did not see; `reference_rates` differentiates what they did.
 2. `synchronise` finds offset, drift and T from the angular rates; `diagnose` names wrong conventions.
-3. `align_fits.solve` finds delays, H and B of every sensor, the frames and the lever arm, by the method asked for.
+3. `align_fits` (or `align_paper`) finds delays, H and B of every sensor, the frames and the lever arm, by the method asked for.
 4. `align_checks` judges; `align_errors` says what the orientation gains.
 
 The frame of the result is `gyr-symmetric`: that in which the gyroscope's K is symmetric (R-BSN (17)).
@@ -16,28 +16,26 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from margcal.core import so3
 from margcal.core.errors import DataError, InputError, UsageError
 from margcal.core.types import Array, Calibration, Issue, Kind, Recording, Reference, Stream, Verdict
-from margcal.core.units import KINDS, STANDARD_GRAVITY, UNITS
-from margcal.methods.clock import gyroscope_at_reference
+from margcal.core.units import KINDS, STANDARD_GRAVITY
 from margcal.methods.r_bsn import polar_split
-from margcal.methods.reference_rates import ReferenceRates, reference_rates
+from margcal.methods.reference_rates import reference_rates
 from margcal.workflow import align_diagnose
 from margcal.workflow.align_checks import Check, checks_of, failed_sensors, with_expected_error
 from margcal.workflow.align_errors import orientation_errors
-from margcal.workflow.align_fits import of_raw_axes, solve, with_axis_reversed
+from margcal.workflow.align_fits import of_raw_axes, solve_right, with_axis_reversed
 from margcal.workflow.align_job import (
     METHODS,
-    AlignFigures,
     AlignJob,
     AlignOptions,
     AlignSolved,
     Method,
     MocapAlignment,
     Tick,
-    thinned,
 )
+from margcal.workflow.align_paper import solve_paper
+from margcal.workflow.align_results import figures, notes, values
 from margcal.workflow.checks import verdict_of
 from margcal.workflow.job import NAMES
 from margcal.workflow.lint import lint
@@ -124,7 +122,7 @@ def align(
     options = _options(recording, reference, method, as_printed, norm, sensors, gravity, field, place)
     common = own if common_clock is None else common_clock
     job = _job(recording, reference, common, options, static, issues, say)
-    solved = solve(job, say)
+    solved = solve_paper(job, say) if options.method == "r-bsn" else solve_right(job, say)
     calibration = _assembled(job, solved, issues, keep_failed=allow_fail)
     say(8, 9)
     calibration = _with_orientation(job, solved, calibration, wanted=orientation)
@@ -277,14 +275,14 @@ def _assembled(job: AlignJob, solved: AlignSolved, issues: list[Issue], *, keep_
     if "gyr" in lost or any(i.level == "fail" and i.sensor is None for i in issues):
         lost = set(solved.models)  # without the gyroscope there is no frame for the others
     models = dict(solved.models) if keep_failed else {k: m for k, m in solved.models.items() if k not in lost}
-    issues += _notes(job, solved)
+    issues += notes(job, solved)
     return Calibration(
         acc=models.get("acc"),
         gyr=models.get("gyr"),
         mag=models.get("mag"),
         frame="gyr-symmetric",
         issues=tuple(dict.fromkeys(issues)),
-        alignment=MocapAlignment(job.sync.common_clock, _values(job, solved), _figures(job, solved)),
+        alignment=MocapAlignment(job.sync.common_clock, values(job, solved), figures(job, solved)),
         settings={"checks": [_plain(c) for c in checks], "method": options.method},
         fits=dict(solved.fits),
     )
@@ -294,102 +292,15 @@ def _plain(check: Check) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(check).items()}
 
 
-def _values(job: AlignJob, solved: AlignSolved) -> dict[str, Any]:
-    """`alignment` of the calibration file."""
-    sync = job.sync
-    values: dict[str, Any] = {"offset_s": sync.offset_s, "drift_ppm": sync.drift_ppm}
-    if solved.R_kh is not None:
-        values["marker_to_node"] = so3.quat_from_matrix(solved.R_kh.T).tolist()
-    if solved.R_nm is not None:
-        values["lab_to_earth"] = so3.quat_from_matrix(solved.R_nm).tolist()
-    if solved.lever_arm is not None:
-        values["lever_arm_m"] = solved.lever_arm[0].tolist()
-        values["lever_arm_m_se"] = solved.lever_arm[1].tolist()
-    if not sync.common_clock:
-        values["offset_s_se"], values["drift_ppm_se"] = sync.offset_se_s, sync.drift_se_ppm
-    if solved.R_kh_se is not None and np.isfinite(solved.R_kh_se).all():
-        values["marker_to_node_se"] = solved.R_kh_se.tolist()
-    if solved.R_nm_se is not None and np.isfinite(solved.R_nm_se).all():
-        values["lab_to_earth_se"] = solved.R_nm_se.tolist()
-    return values
-
-
-def _notes(job: AlignJob, solved: AlignSolved) -> list[Issue]:
-    """What is worth knowing and needs no mending."""
-    notes: list[Issue] = []
-    mag, sync = solved.models.get("mag"), job.sync
-    if mag is not None and job.options.dip is None:
-        text = (
-            "magnetometer: its sign is taken so that det H > 0 (axes not mirrored); give the place (--at) if the board "
-            "flips them"
-        )
-        notes.append(Issue("sign-assumed", "note", text, "mag"))
-    for kind in ("acc", "mag"):
-        if kind in solved.models and kind in solved.delays:
-            delay, se = solved.delays[kind]
-            after = delay - sync.delay_s
-            error = float(np.hypot(se or 0.0, sync.delay_se_s))
-            text = (
-                f"{NAMES[kind]}: {1e3 * after:+.2f} +- {1e3 * error:.2f} ms behind the gyroscope; `apply` corrects it"
-            )
-            notes.append(Issue("delay", "note", text, kind, after))
-    return notes
-
-
-def _figures(job: AlignJob, solved: AlignSolved) -> AlignFigures:
-    sync, rates = job.sync, job.rates
-    gyr = job.raw.streams["gyr"]
-    raw = gyroscope_at_reference(sync, gyr.t, gyr.y, rates)
-    model, factor = solved.models.get("gyr"), UNITS["gyr"].get(gyr.unit)
-    R_kh = np.eye(3) if solved.R_kh is None else solved.R_kh
-    seen = rates.w @ R_kh
-    before = np.full_like(seen, np.nan) if factor is None else raw * factor - rates.w
-    after = np.full_like(seen, np.nan) if model is None else model.apply(raw) - seen
-    residual_t: dict[Kind, Array] = {}
-    residual: dict[Kind, Array] = {}
-    for kind, fit in solved.fits.items():
-        left = np.asarray(fit.residual)
-        t = fit.details.get("track_t", rates.t)
-        residual_t[kind], residual[kind] = thinned(t), thinned(left)
-    near = np.abs(sync.lags - (0.0 if sync.common_clock else sync.offset_s)) <= 5.0
-    return AlignFigures(
-        method=job.options.method,
-        lags=thinned(sync.lags[near]),
-        correlation=thinned(sync.correlation[near]),
-        peak=sync.peak,
-        explained=sync.explained,
-        t=thinned(rates.t),
-        rate=thinned(seen),
-        rate_before=thinned(before),
-        rate_after=thinned(after),
-        residual_t=residual_t,
-        residual=residual,
-        masked=_masked(rates),
-        seen=float(rates.valid.mean()),
-        f_m=solved.f_m,
-        h_m=solved.h_m,
-        delays=dict(solved.delays),
-    )
-
-
-def _masked(rates: ReferenceRates) -> tuple[tuple[float, float], ...]:
-    """Stretches longer than the polynomials in which the body was not seen, the longest hundred."""
-    lost = np.concatenate([[False], ~rates.valid, [False]])
-    starts, stops = np.flatnonzero(~lost[:-1] & lost[1:]), np.flatnonzero(lost[:-1] & ~lost[1:])
-    spans = [(float(rates.t[a]), float(rates.t[b - 1])) for a, b in zip(starts, stops) if b - a > rates.points // 2]
-    spans = sorted(spans, key=lambda s: s[0] - s[1])[:100]
-    return tuple(sorted(spans))
-
-
 def _with_orientation(job: AlignJob, solved: AlignSolved, calibration: Calibration, *, wanted: bool) -> Calibration:
     alignment = calibration.alignment
     if not (wanted and isinstance(alignment, MocapAlignment) and alignment.figures is not None):
         return calibration
     before, after, issues = orientation_errors(job, solved, calibration)
-    figures = replace(alignment.figures, before=before, after=after)
+    shown = replace(alignment.figures, before=before, after=after)
     return replace(
         calibration,
-        alignment=replace(alignment, figures=figures),
+        alignment=replace(alignment, figures=shown),
         issues=(*calibration.issues, *issues),
     )
 

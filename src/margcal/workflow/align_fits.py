@@ -11,12 +11,10 @@ from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit, Issue, Kind, Mask, SensorModel, Stream
 from margcal.methods import mocap_fit
-from margcal.methods.clock import gyroscope_at_reference
 from margcal.methods.delays import SensorDelay, accelerometer_delay, delay_of, delay_of_lowest
-from margcal.methods.mocap_excitation import attitude_excitation, rate_excitation
-from margcal.methods.mocap_frame import CommonFrame, common_frame, earth_from_laboratory
-from margcal.methods.r_bsn import RBsn, laboratory_vector, polar_split, r_bsn
-from margcal.methods.reference_rates import attitude_at, reference_rates, resample
+from margcal.methods.mocap_frame import CommonFrame, common_frame
+from margcal.methods.r_bsn import laboratory_vector
+from margcal.methods.reference_rates import attitude_at, resample
 from margcal.workflow.align_diagnose import check_laboratory
 from margcal.workflow.align_job import AlignJob, AlignSolved, Tick
 from margcal.workflow.job import NAMES
@@ -32,11 +30,6 @@ DELAY_MATTERS_S = 5e-4
 LARGEST_DELAY_S = 0.3
 APART, WIDE = 2.0, 0.005
 """Standard errors between the two estimates of T from which errors are widened; difference that is warned of."""
-
-
-def solve(job: AlignJob, tick: Tick) -> AlignSolved:
-    """Every sensor by the job's method; one that the motion does not carry is left out with the reason."""
-    return _paper(job, tick) if job.options.method == "r-bsn" else _right(job, tick)
 
 
 # --- readings and attitudes at the same times -----------------------------------------------------------
@@ -95,7 +88,7 @@ def _magnetometer_delay(job: AlignJob, start: float) -> SensorDelay:
     return delay_of(job.sync.reference_time(mag.t), mag.y, job.rates.t, u, start=start)
 
 
-def _usable(delay: SensorDelay) -> bool:
+def usable(delay: SensorDelay) -> bool:
     told = np.isfinite(delay.se_s) and delay.se_s < TOLD_SE_S and abs(delay.delay_s) < LARGEST_DELAY_S
     return bool(told and delay.explained > EXPLAINED)
 
@@ -109,7 +102,8 @@ def _unknown_delay(kind: Kind, delay: SensorDelay | None) -> Issue:
 # --- the right way --------------------------------------------------------------------------------------
 
 
-def _right(job: AlignJob, tick: Tick) -> AlignSolved:
+def solve_right(job: AlignJob, tick: Tick) -> AlignSolved:
+    """Every sensor by `mocap_fit`; one that the motion does not carry is left out with the reason."""
     solved, wanted = AlignSolved(), job.options.sensors
     fits: dict[Kind, Fit] = {}
     _gyroscope(job, solved, fits)
@@ -184,7 +178,7 @@ def _magnetometer(job: AlignJob, solved: AlignSolved) -> Fit:
     mag = job.recording.streams["mag"]
     d = job.sync.delay_s
     delay = magnetometer_delay(job)
-    if _usable(delay):
+    if usable(delay):
         d = delay.delay_s
         solved.delays["mag"] = (d, delay.se_s)
     else:
@@ -203,7 +197,7 @@ def _accelerometer(job: AlignJob, solved: AlignSolved) -> Fit:
     known = known & np.isfinite(p).all(axis=1)
     fit = mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit)
     delay = accelerometer_delay(job.sync.reference_time(acc.t), acc.y, job.rates, start=d)
-    if not _usable(delay):
+    if not usable(delay):
         solved.issues.append(_unknown_delay("acc", delay))
         return fit
     solved.delays["acc"] = (delay.delay_s, delay.se_s)
@@ -247,15 +241,15 @@ def _same_handed(job: AlignJob, fits: dict[Kind, Fit]) -> None:
                 continue  # positions tell an accelerometer's sign
             nearness = float(np.trace(C.T @ so3.polar(fit.model.H)[0] @ flip))
             if nearness < 0:
-                fits[kind] = _negated(fit)
+                fits[kind] = negated(fit)
     acc, mag = fits.get("acc"), fits.get("mag")
     if job.options.dip is None or acc is None or mag is None or acc.u is None or mag.u is None:
         return
     if float(acc.u @ mag.u) * np.sin(job.options.dip) > 0:  # the field points down where the dip is positive
-        fits["mag"] = _negated(mag)
+        fits["mag"] = negated(mag)
 
 
-def _negated(fit: Fit) -> Fit:
+def negated(fit: Fit) -> Fit:
     """(-H, B, -u) with its covariance."""
     signs = np.concatenate([-np.ones(9), np.ones(3)])
     C = None if fit.covariance is None else fit.covariance * np.outer(signs, signs)
@@ -282,130 +276,6 @@ def _take_frame(job: AlignJob, solved: AlignSolved, frame: CommonFrame, fits: di
     if acc is not None and "lever_arm" in acc.details:
         se = np.sqrt(np.maximum(np.diag(acc.details["joint"])[15:18], 0.0))
         solved.lever_arm = (np.asarray(acc.details["lever_arm"]), se)
-
-
-# --- the paper's way ------------------------------------------------------------------------------------
-
-
-def _paper(job: AlignJob, tick: Tick) -> AlignSolved:
-    solved, sync, rates, options = AlignSolved(), job.sync, job.rates, job.options
-    streams = job.recording.streams
-    solved.delays["gyr"] = (sync.delay_s, sync.delay_se_s if sync.common_clock else 0.0)
-    delays = {"acc": sync.delay_s, "mag": sync.delay_s}
-    if "mag" in options.sensors:
-        try:  # not in the paper, which takes all sensors for simultaneous
-            found = magnetometer_delay(job)
-            if _usable(found):
-                delays["mag"] = found.delay_s
-                solved.delays["mag"] = (found.delay_s, found.se_s)
-        except DataError:
-            pass
-    tick(5, 9)
-    node = sync.node_time(rates.t)
-    w_ref = reference_rates(job.reference, as_printed=True).w if options.as_printed else rates.w
-    turning = rate_excitation(rates.w[rates.valid])
-    if turning.level == "fail":
-        raise DataError(turning.text, (Issue("poor-excitation", "fail", turning.text, "gyr"),))
-    readings = {
-        kind: y
-        for kind in ("acc", "mag")
-        if kind in options.sensors
-        and (y := _excited(job, solved, kind, resample(streams[kind].t, streams[kind].y, node + delays[kind])))
-        is not None
-    }
-    gyr = gyroscope_at_reference(sync, streams["gyr"].t, streams["gyr"].y, rates)
-    found = r_bsn(
-        w_ref,
-        rates.R,
-        gyr,
-        readings.get("acc"),
-        readings.get("mag"),
-        b_w=None if job.static_bias is None else job.static_bias[0],
-        gravity=options.gravity,
-        field=options.field_uT or 1.0,
-        norm=options.norm,
-        units={k: (s.unit, options.units[k]) for k, s in streams.items()},
-        allow_mirrored=options.as_printed,
-    )
-    tick(8, 9)
-    _take_paper(job, solved, found)
-    if options.as_printed:
-        solved.issues.append(_as_printed(job, gyr - found.fits["gyr"].model.B, w_ref, found.T))
-    return solved
-
-
-def _excited(job: AlignJob, solved: AlignSolved, kind: Kind, y: Array) -> Array | None:
-    """The readings, if the attitudes in which they were taken can carry a fit."""
-    use = np.isfinite(y).all(axis=1) & job.rates.valid
-    R = job.rates.R[use]
-    try:
-        v = laboratory_vector(y[use], R, so3.nearest_rotation(job.sync.T))
-        spread = attitude_excitation(kind, np.einsum("nji,j->ni", R, v))
-        text = spread.text if spread.level == "fail" else None
-    except DataError as error:
-        text = str(error)
-    if text is None:
-        return y
-    solved.issues.append(Issue("poor-excitation", "fail", text, kind))
-    return None
-
-
-def _as_printed(job: AlignJob, Omega: Array, w_ref: Array, T: Array) -> Issue:
-    """What (14) as printed leaves of the rate, beside what it leaves corrected."""
-    use = np.isfinite(Omega).all(axis=1) & np.isfinite(w_ref).all(axis=1)
-    left = np.sum((w_ref[use] - Omega[use] @ T.T) ** 2) / np.sum(w_ref[use] ** 2)
-    text = (
-        f"(14) as printed gives the rate in the laboratory's axes: T leaves {100 * left:.0f} % of its square "
-        f"(corrected {100 * (1 - job.sync.explained):.2f} %), det T {np.linalg.det(T):.3g} (corrected "
-        f"{np.linalg.det(job.sync.T):.3g}); everything that follows is in no known frame"
-    )
-    return Issue("as-printed", "fail", text, None, float(left), 1 - job.sync.explained)
-
-
-def _take_paper(job: AlignJob, solved: AlignSolved, found: RBsn) -> None:
-    fits = dict(found.fits)
-    if "mag" in fits and "acc" in fits and job.options.dip is not None and found.f_m is not None:
-        h = fits["mag"].u
-        if h is not None and float(found.f_m @ h) * np.sin(job.options.dip) > 0:
-            fits["mag"] = _negated(fits["mag"])
-    fits["gyr"] = _gyroscope_covariance(job, fits["gyr"], found)
-    for kind in job.options.sensors:
-        if kind in fits:
-            solved.fits[kind] = fits[kind]
-            solved.models[kind] = fits[kind].model
-    solved.R_kh = found.C_b
-    solved.f_m, solved.h_m = found.f_m, fits["mag"].u if "mag" in fits else None
-    if solved.f_m is not None and solved.h_m is not None:
-        solved.R_nm = earth_from_laboratory(solved.f_m, solved.h_m)
-    if "acc" in fits and found.gated < 0.999:
-        text = (
-            f"accelerometer: {100 * (1 - found.gated):.0f} % of the samples were left out by the gate of (20) "
-            "(linear acceleration)"
-        )
-        solved.issues.append(Issue("gated", "note", text, "acc", 1 - found.gated))
-
-
-def _gyroscope_covariance(job: AlignJob, fit: Fit, found: RBsn) -> Fit:
-    """Covariance of (K_w row by row, b_w) from that of T (jackknife) and of b_w, K_w = C^bT T sym by numbers."""
-    T, step = found.T, 1e-6 * float(np.linalg.norm(found.T))
-    J = np.zeros((12, 9))
-    se = np.zeros(9)
-    for k in range(9):
-        moved = T.copy()
-        moved[k // 3, k % 3] += step
-        try:
-            J[:9, k] = (polar_split(moved, True)[1] - fit.model.H).ravel() / step
-            se[k] = 1.0
-        except DataError:
-            continue
-    C = J @ found.T_covariance @ J.T
-    if job.static_bias is not None:
-        C[9:, 9:] = np.diag(job.static_bias[1] ** 2)
-    else:
-        Tinv = np.linalg.inv(job.sync.T)
-        C[9:, 9:] = Tinv @ job.sync.covariance[9:, 9:] @ Tinv.T
-    model = replace(fit.model, covariance=(C + C.T) / 2)
-    return replace(fit, model=model, covariance=model.covariance)
 
 
 # --- a mirrored gyroscope -------------------------------------------------------------------------------

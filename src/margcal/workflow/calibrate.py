@@ -26,6 +26,7 @@ from margcal.workflow.checks import verdict_of
 from margcal.workflow.decide import decide
 from margcal.workflow.job import NAMES, Job, Options, Solved
 from margcal.workflow.lint import clipped, lint
+from margcal.workflow.motion_delay import keep_magnetometer_delay
 from margcal.workflow.segment import Segmentation, find_poses, measure_spans, measured
 from margcal.workflow.swing import swing_only, try_swing
 
@@ -105,6 +106,7 @@ def calibrate(
     job = _job(usable, poses, options, level, issues)
     issues = _without_harmless(job, issues)
     solved = _solve(job, auto=poses == "auto")
+    keep_magnetometer_delay(job, solved)
     calibration = assemble(job, solved, issues, keep_failed=allow_fail)
     calibration = replace(
         calibration,

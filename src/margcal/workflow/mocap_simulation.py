@@ -8,7 +8,7 @@ of time: attitude, rate, position and acceleration agree exactly.
 name here      meaning
 =============  ===============================================================================
 n, m           earth (ENU) and the laboratory frame of the cameras, turned by `yaw_deg` and a little tilt
-h, k           node (its housing; see `in_frame` for others) and marker body
+h, k           node (its housing; see `gyr_symmetric` for the frame of `align`) and marker body
 t_ref          time of the cameras: ``t_ref = offset_s + (1 + drift_ppm 1e-6) t_node``
 =============  ===============================================================================
 """

@@ -141,7 +141,7 @@ def orient(
     state = chosen.start(q, sd)
     track = _run(chosen, params, state, dt, gyr, samples.acc, samples.mag, progress)
     figures = _figures(track, samples, bias, late, around)
-    issues += _told(track, samples, "mag" in streams)
+    issues += _told(chosen, track, samples, "mag" in streams)
     turned = _continuous(so3.quat_multiply(from_enu, track.q))
     return Orientation(
         Attitude(samples.t, turned, parent=f"earth ({frame})", child="node"),
@@ -250,7 +250,7 @@ def _figures(
     }
 
 
-def _told(track: Track, samples: Samples, has_mag: bool) -> list[Issue]:
+def _told(chosen: Filter, track: Track, samples: Samples, has_mag: bool) -> list[Issue]:
     """Issues of what happened on the way."""
     issues = []
     gap = np.flatnonzero(track.flags & GAP)
@@ -265,6 +265,9 @@ def _told(track: Track, samples: Samples, has_mag: bool) -> list[Issue]:
     if blind > 0:
         text = f"the rate is not known for up to {blind:.3g} s on end: the attitude is held and found again afterwards"
         issues.append(Issue("no-rate", "warn", text, "gyr", blind))
+    if not chosen.corrects:
+        text = "the gyroscope alone: the attitude drifts away from the first one"
+        return [*issues, Issue("drifts", "note", text, "gyr")]
     if not has_mag:
         text = "no magnetometer: the heading is relative to the start and drifts with the gyroscope"
         issues.append(Issue("heading-drifts", "note", text, "mag"))

@@ -133,10 +133,11 @@ def _in_si(calibration: Calibration, recording: Recording) -> dict[Kind, Stream]
                 f"{recording.source}: {kind} is in {stream.unit}, the calibration gives {model.unit}{hint}"
             )
         seen = np.isfinite(stream.y).all(axis=1)
-        out[kind] = Stream(kind, stream.t[seen], stream.y[seen] * factor, wanted)
+        if seen.sum() > 1:
+            out[kind] = Stream(kind, stream.t[seen], stream.y[seen] * factor, wanted)
     if not out:
         raise InputError(
-            f"{recording.source}: holds {', '.join(recording.streams) or 'no sensor'}, the calibration is of "
+            f"{recording.source}: has readings of {', '.join(recording.streams) or 'no sensor'}, the calibration is of "
             f"{', '.join(calibration.models) or 'no sensor'}; give a recording of the calibrated node"
         )
     return out

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Protocol
 
 from margcal.core.compiled import state
 from margcal.core.errors import InputError
@@ -14,14 +14,21 @@ from margcal.core.types import Attitude, Calibration, Recording, SensorModel
 from margcal.files.tables import read
 from margcal.methods.ellipsoid import ellipsoid
 from margcal.methods.filters import FILTERS
+from margcal.workflow.align import align
 from margcal.workflow.calibrate import calibrate
 from margcal.workflow.orient import orient
 
-Filter = Callable[[Recording], Attitude]
+
+class Filter(Protocol):
+    """A recording in SI, or a raw one with its calibration, to attitudes."""
+
+    def __call__(self, recording: Recording, calibration: Calibration | None = None, /) -> Attitude: ...
+
 
 PHONE = "Nexus5"
 SESSIONS = tuple(f"calib_{kind}_{PHONE}_d1" for kind in ("acc", "gyr", "mag"))
 MOTIONS = ("Jakob_Nexus5_NoDist_AR", "Thibaud_Nexus5_NoDist_AR", "Thibaud_Nexus5_NoDist_Swinging")
+ALIGNED_ON = MOTIONS[0]
 PHONE_FIELD = 48.0
 
 
@@ -71,6 +78,11 @@ def phone_calibration(folder: Path) -> tuple[Calibration, dict[str, SensorModel]
     return calibrated, {"mag": sphere}
 
 
+def phone_alignment(folder: Path) -> Calibration:
+    """H, B and delays of the phone by `align` from one motion, which is then no test of them."""
+    return align(read(folder / "tyrex" / ALIGNED_ON), field=PHONE_FIELD, orientation=False, allow_fail=True)
+
+
 # --- filters ------------------------------------------------------------------------------------------
 
 
@@ -89,5 +101,6 @@ def filters() -> dict[str, Filter]:
     return {name: partial(_attitude, name) for name in there}
 
 
-def _attitude(name: str, recording: Recording) -> Attitude:
-    return orient(recording, filter=name).attitude
+def _attitude(name: str, recording: Recording, calibration: Calibration | None = None) -> Attitude:
+    """`calibration`: of a raw recording, with its delays; without one the recording is in SI."""
+    return orient(recording, calibration, filter=name).attitude

@@ -107,7 +107,8 @@ def _settings(runs: Sequence[Run], setting: Setting) -> tuple[str, ...]:
         f"{1e3 * setting.marker_noise_m:g} mm",
         f"setting: nodes off by {100 * setting.scale_error:g} % in scale, {setting.non_orthogonality:g} deg in axes, "
         f"{setting.mounting:g} deg in mounting, {setting.hard_iron_uT:g} uT of hard iron (not in the paper)",
-        f"setting: field {FIELD_UT:g} uT, dip {np.degrees(DIP):.1f} deg, the same everywhere; filter ekf-quest",
+        f"setting: field {FIELD_UT:g} uT, dip {np.degrees(DIP):.1f} deg, the same everywhere; filter ekf-quest "
+        "with .01 rad/s and .3 a sample (not in the paper)",
         f"setting: |yaw| of these sessions {short(yaw.min())} to {short(yaw.max())} deg, mean {short(yaw.mean())}; it "
         "and the nodes' errors decide the figure below (last table), so that agreement with 8.8 proves little",
     )

@@ -7,12 +7,13 @@ what the wand was set for; with one, C^b and C^n lead from one to the other.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from margcal.apps.papers.r_bsn_simulation import DIP, FIELD_UT, Node, Session, Setting, session
+from margcal.apps.papers.r_bsn_simulation import DIP, FIELD_UT, NODE_HZ, Node, Session, Setting, session
 from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Attitude, Calibration, Kind, Recording
@@ -30,8 +31,20 @@ UNCALIBRATED, PAPER, OURS, PERFECT = "uncalibrated", "r-bsn (paper)", "default (
 WAYS: dict[str, Method | None] = {PAPER: "r-bsn", OURS: None}
 VARIANTS = (UNCALIBRATED, PAPER, OURS, PERFECT)
 
-FILTER = ekf_quest.Params(field=FIELD_UT, dip=DIP, mag_gate=float("inf"))
-"""The paper's filter with the project's numbers; it gates nothing, as the paper's does not."""
+FILTER = ekf_quest.Params(
+    field=FIELD_UT,
+    dip=DIP,
+    mag_gate=float("inf"),
+    tau=0.5,
+    D=50.0,
+    rate_noise=0.01 / math.sqrt(NODE_HZ),
+    quest_noise=2 * 0.3 / math.sqrt(NODE_HZ),
+    mag_weight=1.0,
+)
+"""The paper's filter, plainly: it gates nothing, (10) has equal weights, (8) has .01 rad/s and .3 a sample.
+
+The paper gives no numbers. These are fixed here, so that `margcal orient` may be tuned without changing this table.
+"""
 
 Tick = Callable[[int], None]
 

@@ -1,4 +1,4 @@
-"""Parameters of ArduPilot, PX4 and Betaflight.
+"""Parameters of ArduPilot and PX4.
 
 ArduPilot   Form      compass: M (R y + OFS); accelerometer: R (SCAL (y - OFFS)); gyroscope: R (y - OFFS)
             Fields    COMPASS_OFS_X.., COMPASS_DIA_X.., COMPASS_ODI_X (xy), _Y (xz), _Z (yz), COMPASS_SCALE (1),
@@ -8,17 +8,14 @@ PX4         Form      magnetometer: R (M (y - OFF)); accelerometer: R (SCALE (y 
             Fields    CAL_MAG0_XOFF.., _XSCALE.., _XODIAG (xy), _YODIAG (xz), _ZODIAG (yz), CAL_MAG0_ROT;
                       CAL_ACC0_XOFF.., _XSCALE..; CAL_GYRO0_XOFF..; SENS_BOARD_ROT
             Units     gauss; m/s^2; rad/s
-Betaflight  Form      accelerometer and magnetometer: y - zero, in counts of its driver
-            Fields    set acc_calibration = x,y,z,1; set mag_calibration = x,y,z (16-bit integers)
 R is one of the board orientations that all of them number alike (see `fitting`); M is symmetric.
-Carries     magnetometer: 6 of 9 numbers; accelerometer: a scale an axis; gyroscope: bias only. Betaflight: bias only
+Carries     magnetometer: 6 of 9 numbers; accelerometer: a scale an axis; gyroscope: bias only
 
 ArduPilot rotates the compass BEFORE offsets and matrix, PX4 after: read in AP_Compass_Backend.cpp (rotate_field comes
 before publish_raw_field and correct_field) and in sensor_calibration/Magnetometer.hpp (Correct). So for ArduPilot
 H = M R and OFS = -R B, for PX4 H = R M and OFF = B. Ranges of ArduPilot: @Range of AP_InertialSensor_Params.cpp,
 limits of CompassCalibrator.cpp (DIA, ODI), COMPASS_OFFS_MAX; of PX4: its parameter reference (not read in source).
-Betaflight: sensors/acceleration.c (applyAccelerationTrims). The node's frame must be the vehicle's: x forward,
-y right, z down.
+The node's frame must be the vehicle's: x forward, y right, z down.
 """
 
 from __future__ import annotations
@@ -325,56 +322,6 @@ def _read_px4(data: bytes, name: str, kinds: tuple[Kind, ...]) -> Page:
     return _page(text, _values(lines, name), PX4_NAMES, PX4_FORMS, name)
 
 
-def _encode_zero(H: Array, B: Array, R: Array) -> Fields:
-    return {"zero": np.rint(B)}
-
-
-def _decode_zero(fields: Fields) -> tuple[Array, Array]:
-    return np.eye(3), fields["zero"]
-
-
-def _apply_zero(fields: Fields, y: ArrayLike) -> Array:
-    return np.asarray(y) - fields["zero"]
-
-
-_ZERO = Form(
-    "y - zero",
-    _encode_zero,
-    _decode_zero,
-    _apply_zero,
-    matrix="unit",
-    raw=("count",),
-    unit="count",
-    nominal=True,
-    ranges=(Range("zero", -32768, 32767, "counts", shown="acc_calibration, mag_calibration"),),
-)
-BETAFLIGHT_FORMS: dict[Kind, Form] = {"acc": _ZERO, "mag": _ZERO}
-
-
-def _write_betaflight(page: Page) -> bytes:
-    out = texts.comment([*texts.heading(page), *texts.vector_lines(page)], "#")
-    for kind, sensor in page.sensors.items():
-        cells = [str(int(v)) for v in sensor.fields["zero"]] + (["1"] if kind == "acc" else [])
-        out += f"set {kind}_calibration = {','.join(cells)}\n"
-    return (out + "save\n").encode()
-
-
-def _read_betaflight(data: bytes, name: str, kinds: tuple[Kind, ...]) -> Page:
-    text = texts.decode(data, name)
-    vectors, found = texts.vectors_in(text), {}
-    for kind in BETAFLIGHT_FORMS:
-        hits = re.findall(
-            rf"^[ \t]{{0,20}}set {kind}_calibration {{0,9}}= {{0,9}}([-\d, ]{{5,60}})\r?$", text, re.MULTILINE
-        )
-        if hits:
-            values = [float(v) for v in hits[-1].split(",") if v.strip().lstrip("-").isdigit()][:3]
-            fields = {"zero": texts.array(values, (3,), f"{kind}_calibration", name)}
-            found[kind] = Sensor(fields, "count", "count", vectors.get(kind))
-    if not found:
-        raise InputError(f"{name}: holds no 'set acc_calibration' and no 'set mag_calibration'")
-    return Page(found, *texts.about(text))
-
-
 _FRD = "the node's frame must be the vehicle's: x forward, y right, z down"
 ARDUPILOT = Target(
     "ardupilot",
@@ -397,15 +344,4 @@ PX4 = Target(
     1e-7,
     "PX4 sensor_calibration: Magnetometer.hpp, Accelerometer.hpp, Gyroscope.hpp",
     remark=f"{_FRD}; CAL_..._ID must match your sensors",
-)
-BETAFLIGHT = Target(
-    "betaflight",
-    "Betaflight CLI",
-    ".txt",
-    BETAFLIGHT_FORMS,
-    _write_betaflight,
-    _read_betaflight,
-    1e-2,
-    "Betaflight, sensors/acceleration.c",
-    remark="bias only, in whole counts; scale is the sensor's nominal one, axes those of align_...",
 )

@@ -8,6 +8,7 @@ from margcal.core.errors import UsageError
 from margcal.files.exchange import (
     autopilots,
     basalt,
+    betaflight,
     c_code,
     c_fixed,
     coefficients,
@@ -41,7 +42,7 @@ TARGETS: dict[str, Target] = {
         ros_imu_calib.ROS_IMU_CALIB,
         autopilots.ARDUPILOT,
         autopilots.PX4,
-        autopilots.BETAFLIGHT,
+        betaflight.BETAFLIGHT,
         magneto.MOTIONCAL,
         magneto.MAGNETO,
         coefficients.QMT,
