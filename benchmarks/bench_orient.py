@@ -290,7 +290,9 @@ def summary(
         "at most 1.6",
     )
     for name, row in whole.items():
-        for ours in ("vector-selection", "ekf-quest") if row else ():
+        for ours in ("vector-selection", "ekf-quest"):
+            if row is None:
+                continue
             limit = "target at most .5" if name == "60 s" else ""
             ratios[f"orient {ours}, {name}, over pandas + vqf"] = (row[ours] / row["pandas + vqf"], limit)
     return ratios

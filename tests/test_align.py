@@ -86,6 +86,11 @@ def test_the_papers_method_is_worse_and_says_so(sim: MocapSimulation) -> None:
     assert wrong(found, sim.gyr_symmetric, "acc") > 0.01
     assert wrong(found, sim.gyr_symmetric, "gyr") < 1e-3
     assert "gated" in codes(found, "note")
+    assert "linear-acceleration" in codes(found, "warn")
+    calm = simulate_mocap(seed=4, duration_s=40)
+    assert "linear-acceleration" not in codes(
+        align(calm.recording, calm.reference, method="r-bsn", orientation=False), "warn"
+    )
 
 
 def test_trial_at_rest(sim: MocapSimulation) -> None:

@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -47,8 +48,9 @@ void bind_moving_scatter(const In& t, const In& y, const In& centres, double wid
     std::size_t longest = 0, size = 1;
     for (std::size_t j = 0; j < lo.size(); ++j) longest = std::max(longest, hi[j] - lo[j]);
     while (size < longest + SCATTER_BLOCK + 1) size *= 2;
-    std::vector<double> ring(4 * size), work(std::size_t(n - 1));
-    const double expected = width / median_step(time, std::size_t(n), work.data());
+    std::vector<double> ring(4 * size);
+    const std::unique_ptr<double[]> work(new double[std::size_t(n - 1)]);
+    const double expected = width / median_step(time, std::size_t(n), work.get());
     kernels.scatter(readings, std::size_t(n), lo.data(), hi.data(), lo.size(), expected, ring.data(), size - 1, scatter,
                     average);
 }

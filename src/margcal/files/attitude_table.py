@@ -62,16 +62,14 @@ def read_attitudes(path: str | os.PathLike[str], *, prefer: Prefix = "q") -> Att
     """
     path = Path(path)
     tables = [open_table(p) for p in (tables_in(path) if path.is_dir() else [path])]
-    holding = [t for t in tables if _prefix(t, prefer) is not None]
+    holding = [(t, prefix) for t in tables if (prefix := _prefix(t, prefer)) is not None]
     if not holding:
         listed = ", ".join(printable(n, 40) for t in tables for n in t.names[:20])
         raise InputError(f"{printable(path.name)}: no attitudes among the columns ({listed}); name them qw qx qy qz")
     if len(holding) > 1:
-        where = " and in ".join(t.file for t in holding)
+        where = " and in ".join(t.file for t, _ in holding)
         raise InputError(f"{printable(path.name)}: attitudes are in {where}; give one of the tables")
-    table = holding[0]
-    prefix = _prefix(table, prefer)
-    assert prefix is not None
+    table, prefix = holding[0]
     attitude, issues = _attitude(table, prefix)
     moving = next((t for t in [table, *tables] if "movement" in _lower(t)), None)
     return AttitudeTable(attitude, prefix, None if moving is None else _movement(moving), table.file, issues)

@@ -96,8 +96,9 @@ class Params(NamedTuple):
     `tau` and `D` are a hand's and hardly matter beside a gyroscope. `rate_noise` is reckoned: a gyroscope that is off
     by 0.2 deg/s, or by 0.5 % of a quick turn, for a second. Its ratio to `quest_noise` is the time in which QUEST is
     believed, 33 s: it and the two settings of the magnetometer were chosen on the four motions of tyrex (phones,
-    Qualisys). There 0.06 and 0.1 are alike (2.3 degrees) where no magnet is near and 0.1 is better where one is;
-    weights of 1, 3 and 10 differ by 3 %; without the gate the error near magnets doubles.
+    Qualisys). There 0.06 and 0.1 are alike (2.4 degrees) where no magnet is near and 0.1 is better where one is;
+    weights of 1, 3 and 10 differ by 3 %; without the gate the error near magnets is more than double
+    (benchmarks/studies/filter_settings.py).
     """
 
     gravity: float = STANDARD_GRAVITY

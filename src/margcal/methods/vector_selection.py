@@ -102,13 +102,14 @@ class Params(NamedTuple):
 
     Notes
     -----
-    `rate_noise` is reckoned (a gyroscope that is off by 0.2 deg/s, or by 0.5 % of a quick turn, for a second); its
-    ratio to the other two, which is all that matters between disturbances, makes the tilt forget within 5 s and the
-    heading within 20 s. They and the gates were chosen on the four motions of tyrex (phones, Qualisys 60 Hz), mean
-    error there by `acc_gate`: 0.05 3.7, 0.1 3.7, 0.2 3.4, 0.5 3.0, 3 and more 3.0 degrees. A gate on the length
-    keeps the readings that happen to have the right length, and their mean is no vertical; all of them together
-    average to one. So the accelerometer's gate only keeps out impacts, and what is selected is, in the main, the
-    magnetometer.
+    `rate_noise` is reckoned: a gyroscope that is off by 0.2 deg/s, or by 0.5 % of a quick turn, for a second. Its ratio
+    to the other two, which is all that matters between disturbances, makes the tilt forget within 5 s and the heading
+    within 20 s. The tilt's and the gates were chosen on the four motions of tyrex (phones, Qualisys 60 Hz); there the
+    heading would like to forget more slowly, but there the gyroscope's bias was known from the optics, and 20 s is what
+    0.05 deg/s of it allow. Mean error on tyrex by `acc_gate`: 0.05 4.1, 0.1 4.2, 0.2 4.0, 0.5 3.5, 3 and more 3.5
+    degrees (benchmarks/studies/filter_settings.py). A gate on the length keeps the readings that happen to have the
+    right length, and their mean is no vertical; all of them together average to one. So the accelerometer's gate only
+    keeps out impacts, and what is selected is, in the main, the magnetometer.
     """
 
     gravity: float = STANDARD_GRAVITY

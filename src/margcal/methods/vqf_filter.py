@@ -119,10 +119,9 @@ def _each_node(run: Any, params: Params, state: Any, dt: Any, gyr: Any, acc: Any
     if gyr.ndim == 2:
         return run(params, state, _prepared(params, dt, gyr, acc, mag))
     starts = [State({}, q, np.zeros((), dtype=np.uint8)) for q in state.q] if isinstance(state, State) else list(state)
-    done = [run(params, s, _prepared(params, d, w, a, m)) for s, d, w, a, m in zip(starts, dt, gyr, acc, mag)]
-    return Track(
-        *(np.stack([getattr(d, n) for d in done]) for n in ("q", "variance", "flags")), [d.state for d in done]
-    )
+    done = [run(params, s, _prepared(params, dt[k], gyr[k], acc[k], mag[k])) for k, s in enumerate(starts)]
+    q, variance, flags = (np.stack([getattr(d, n) for d in done]) for n in ("q", "variance", "flags"))
+    return Track(q, variance, flags, [d.state for d in done])
 
 
 def _prepared(params: Params, dt: Array, gyr: Array, acc: Array, mag: Array) -> _Samples:

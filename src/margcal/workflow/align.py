@@ -2,7 +2,7 @@
 
 1. `clean_reference` masks what the optics did not see; `reference_rates` differentiates what they did.
 2. `synchronise` finds offset, drift and T from the angular rates; `diagnose` names wrong conventions.
-3. `align_fits` (or `align_paper`) finds delays, H and B of every sensor, the frames and the lever arm, by the method asked for.
+3. `align_fits` (or `align_paper`) finds delays, H and B of every sensor, the frames and the lever arm.
 4. `align_checks` judges; `align_errors` says what the orientation gains.
 
 The frame of the result is `gyr-symmetric`: that in which the gyroscope's K is symmetric (R-BSN (17)).

@@ -35,7 +35,7 @@ APART, WIDE = 2.0, 0.005
 # --- readings and attitudes at the same times -----------------------------------------------------------
 
 
-def _placed(job: AlignJob, stream: Stream, delay: float) -> tuple[Array, Array, Array | None, Mask]:
+def placed(job: AlignJob, stream: Stream, delay: float) -> tuple[Array, Array, Array | None, Mask]:
     """Times on the reference's clock at which the readings were sensed, R_mk and p there, and where these are known."""
     t = job.sync.reference_time(stream.t - delay)
     R = attitude_at(job.reference, t)
@@ -82,7 +82,7 @@ def magnetometer_delay(job: AlignJob, rounds: int = 3) -> SensorDelay:
 def _magnetometer_delay(job: AlignJob, start: float) -> SensorDelay:
     """One round: the field in the laboratory for a delay of `start`, then the delay for that field."""
     mag = job.recording.streams["mag"]
-    _, R, _, known = _placed(job, mag, start)
+    _, R, _, known = placed(job, mag, start)
     h = laboratory_vector(mag.y[known], R[known], so3.nearest_rotation(job.sync.T))
     u = np.einsum("nji,j->ni", job.rates.R, h)
     return delay_of(job.sync.reference_time(mag.t), mag.y, job.rates.t, u, start=start)
@@ -134,7 +134,7 @@ def _attempt(solved: AlignSolved, kind: Kind, make: Callable[[], Fit], fits: dic
 def _gyroscope(job: AlignJob, solved: AlignSolved, fits: dict[Kind, Fit]) -> None:
     sync, gyr = job.sync, job.recording.streams["gyr"]
     solved.delays["gyr"] = (sync.delay_s, sync.delay_se_s if sync.common_clock else 0.0)
-    t, R, _, known = _placed(job, gyr, sync.delay_s)
+    t, R, _, known = placed(job, gyr, sync.delay_s)
     _attempt(solved, "gyr", lambda: mocap_fit.gyroscope(t, gyr.y, R, known, raw_unit=gyr.unit), fits)
     if "gyr" in fits:
         fits["gyr"] = _widened(job, solved, fits["gyr"])
@@ -183,16 +183,16 @@ def _magnetometer(job: AlignJob, solved: AlignSolved) -> Fit:
         solved.delays["mag"] = (d, delay.se_s)
     else:
         solved.issues.append(_unknown_delay("mag", delay))
-    t, R, _, known = _placed(job, mag, d)
+    t, R, _, known = placed(job, mag, d)
     return mocap_fit.magnetometer(t, mag.y, R, known, field=job.options.field_uT, raw_unit=mag.unit)
 
 
 def _accelerometer(job: AlignJob, solved: AlignSolved) -> Fit:
     acc, d, options = job.recording.streams["acc"], job.sync.delay_s, job.options
-    t, R, p, known = _placed(job, acc, d)
+    t, R, p, known = placed(job, acc, d)
     if options.method == "lowpass-svd" or p is None:
         return _low_passed(job, solved)
-    rough = mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=options.gravity, raw_unit=acc.unit)
+    rough = mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=options.gravity, raw_unit=acc.unit, gate=False)
     check_laboratory(acc, job.rates, job.sync, rough.model.H, rough.model.B)
     known = known & np.isfinite(p).all(axis=1)
     fit = mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit)
@@ -201,7 +201,7 @@ def _accelerometer(job: AlignJob, solved: AlignSolved) -> Fit:
         solved.issues.append(_unknown_delay("acc", delay))
         return fit
     solved.delays["acc"] = (delay.delay_s, delay.se_s)
-    t, R, p, known = _placed(job, acc, delay.delay_s)
+    t, R, p, known = placed(job, acc, delay.delay_s)
     if p is None or abs(delay.delay_s - d) <= DELAY_MATTERS_S:
         return fit
     known = known & np.isfinite(p).all(axis=1)
@@ -213,7 +213,7 @@ def _low_passed(job: AlignJob, solved: AlignSolved) -> Fit:
     acc, start = job.recording.streams["acc"], job.sync.delay_s
 
     def fit(acc: Stream, delay: float, *, gate: bool = True) -> Fit:
-        t, R, _, known = _placed(job, acc, delay)
+        t, R, _, known = placed(job, acc, delay)
         return mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=job.options.gravity, raw_unit=acc.unit, gate=gate)
 
     first = fit(acc, start)

@@ -11,11 +11,15 @@ from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit, Issue, Kind
 from margcal.methods.clock import gyroscope_at_reference
 from margcal.methods.mocap_excitation import attitude_excitation, rate_excitation
+from margcal.methods.mocap_fit import lowpass_svd
 from margcal.methods.mocap_frame import earth_from_laboratory
 from margcal.methods.r_bsn import RBsn, laboratory_vector, polar_split, r_bsn
 from margcal.methods.reference_rates import reference_rates, resample
-from margcal.workflow.align_fits import magnetometer_delay, negated, usable
+from margcal.workflow.align_fits import magnetometer_delay, negated, placed, usable
 from margcal.workflow.align_job import AlignJob, AlignSolved, Tick
+
+SHRUNK = 0.015
+"""Relative difference of H from a method that linear acceleration does not shrink, above which it is warned of."""
 
 
 def solve_paper(job: AlignJob, tick: Tick) -> AlignSolved:
@@ -109,12 +113,34 @@ def _take_paper(job: AlignJob, solved: AlignSolved, found: RBsn) -> None:
     solved.f_m, solved.h_m = found.f_m, fits["mag"].u if "mag" in fits else None
     if solved.f_m is not None and solved.h_m is not None:
         solved.R_nm = earth_from_laboratory(solved.f_m, solved.h_m)
+    if "acc" in fits and (shrunk := _shrunk(job, fits["acc"], found.C_b)) is not None:
+        solved.issues.append(shrunk)
     if "acc" in fits and found.gated < 0.999:
         text = (
             f"accelerometer: {100 * (1 - found.gated):.0f} % of the samples were left out by the gate of (20) "
             "(linear acceleration)"
         )
         solved.issues.append(Issue("gated", "note", text, "acc", 1 - found.gated))
+
+
+def _shrunk(job: AlignJob, fit: Fit, C_b: Array) -> Issue | None:
+    """What linear acceleration did to the paper's K: its standard errors know nothing of it."""
+    acc, d = job.recording.streams["acc"], job.sync.delay_s
+    t, R, _, known = placed(job, acc, d)
+    try:
+        other = lowpass_svd(t, acc.y, R, known, gravity=job.options.gravity, raw_unit=acc.unit).model.H
+        off = float(np.linalg.norm(C_b @ fit.model.H @ np.linalg.inv(other) - np.eye(3), 2))
+        text = f"accelerometer: H is {100 * off:.1f} % off that of `lowpass-svd`"
+    except DataError:
+        off = (fit.model.residual_rms or 0.0) / job.options.gravity
+        text = f"accelerometer: {100 * off:.1f} % of gravity are left over"
+    if off <= SHRUNK:
+        return None
+    text += (
+        ": linear acceleration, which the paper's (20) has in its regressor, makes K come out too small; its standard "
+        "errors do not contain this. Take `lowpass-svd`, or `forward` with positions"
+    )
+    return Issue("linear-acceleration", "warn", text, "acc", off, SHRUNK)
 
 
 def _gyroscope_covariance(job: AlignJob, fit: Fit, found: RBsn) -> Fit:
