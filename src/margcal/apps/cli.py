@@ -397,17 +397,17 @@ def compare(calibrations: tuple[str, ...], **given: Any) -> int:
 
 
 @cli.command()
-@_output("DIR", True, "Where session.parquet, poses.csv and truth.json go.")
+@_output("DIR", True, "Where session.parquet, poses.csv or reference.parquet, and truth.json go.")
 @click.option("--n-poses", type=int, metavar="N", help="Rests.  [default: 24]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--node-seed", type=click.IntRange(min=0), help="Seed of the node alone: several recordings of one node.")
-@click.option("--poses", type=click.Choice(["cube", "free", "faces", "swing"]), default="cube", show_default=True)
+@click.option("--poses", type=click.Choice(["cube", "free", "faces", "swing", "mocap"]), default="cube", show_default=True)
 @_sensors
 @_at
 @click.option("--rate", type=float, metavar="HZ", help="Samples per second.  [default: 100]")
 @click.option("--rest-s", type=float, metavar="S", help="Length of a rest.  [default: 5]")
 @click.option("--turn-s", type=float, metavar="S", help="Length of a turn.  [default: 1.5]")
-@click.option("--duration-s", type=float, metavar="S", help="Length of a swing.  [default: 60]")
+@click.option("--duration-s", type=float, metavar="S", help="Length of a swing, or in front of cameras.  [default: 60]")
 @click.option("--housing-sd-deg", type=float, metavar="DEG", help="Error of the housing's attitudes.  [default: 0.2]")
 @click.option("--level-sd-deg", type=float, metavar="DEG", help="Tilt of the table.  [default: 0]")
 @click.option("--noise", type=float, metavar="FACTOR", help="On the sensor noise.  [default: 1]")
@@ -418,19 +418,27 @@ def compare(calibrations: tuple[str, ...], **given: Any) -> int:
 @_overwrite
 @_json
 def simulate(duration_s: float | None, **given: Any) -> int:
-    """Write a recording of a node that does not exist, with the truth beside it."""
-    from margcal.apps.simulating import run
+    """Write a recording of a node that does not exist, with the truth beside it.
+
+    It lies in attitudes, is swung about, or is moved in front of cameras on another clock (--poses mocap).
+    """
+    from margcal.apps.simulating import run, run_mocap
 
     only_rests = ("n_poses", "rest_s", "turn_s", "housing_sd_deg", "level_sd_deg", "knocks", "reference")
     rests = {name: given.pop(name) for name in only_rests}
     node = {name: given.pop(name) for name in ("seed", "node_seed", "rate", "noise", "separate_clocks")}
-    if given["poses"] == "swing":
-        wrong = [k for k, v in rests.items() if v]
-        if wrong:
-            raise click.UsageError(f"--{wrong[0].replace('_', '-')} is for rests; --poses swing has none")
+    poses = given["poses"]
+    if poses in ("swing", "mocap"):
+        if wrong := [k for k, v in rests.items() if v]:
+            raise click.UsageError(f"--{wrong[0].replace('_', '-')} is for rests; --poses {poses} has none")
         node["duration_s"] = duration_s
     elif duration_s is not None:
-        raise click.UsageError("--duration-s is for --poses swing")
+        raise click.UsageError("--duration-s is for --poses swing and mocap")
+    if poses == "mocap":
+        if node.pop("separate_clocks") or given.pop("at") or given.pop("board"):
+            raise click.UsageError("--poses mocap takes neither --separate-clocks, --at nor --mag-board")
+        del given["poses"]
+        return run_mocap(**node, **given)
     return run(rests=rests, node=node, **given)
 
 

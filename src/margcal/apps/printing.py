@@ -62,7 +62,7 @@ def _show_quality(calibration: Calibration) -> None:
     rows = []
     for kind, model in calibration.models.items():
         n = "all samples" if model.n_poses is None else str(model.n_poses)
-        unit = "rad a turn" if kind == "gyr" else model.unit
+        unit = "rad a turn" if kind == "gyr" and model.n_poses is not None else model.unit
         residual = "-" if model.residual_rms is None else f"{figure(model.residual_rms, 3)} {unit}"
         error = "-" if model.expected_error_deg is None else f"{figure(model.expected_error_deg, 2)} deg"
         rows.append([NAMES[kind], model.method, n, residual, error])

@@ -62,7 +62,7 @@ def read_attitudes(path: str | os.PathLike[str], *, prefer: Prefix = "q") -> Att
     """
     path = Path(path)
     tables = [open_table(p) for p in (tables_in(path) if path.is_dir() else [path])]
-    holding = [(t, prefix) for t in tables if (prefix := _prefix(t, prefer)) is not None]
+    holding: list[tuple[Table, Prefix]] = [(t, prefix) for t in tables if (prefix := _prefix(t, prefer)) is not None]
     if not holding:
         listed = ", ".join(printable(n, 40) for t in tables for n in t.names[:20])
         raise InputError(f"{printable(path.name)}: no attitudes among the columns ({listed}); name them qw qx qy qz")

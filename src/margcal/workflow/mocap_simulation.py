@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -27,6 +28,7 @@ from margcal.core.errors import InputError
 from margcal.core.types import Alignment, Array, Calibration, Kind, Recording, Reference, SensorModel, Stream
 from margcal.core.units import KINDS, STANDARD_GRAVITY
 from margcal.workflow.motion import State, Swing, random_directions
+from margcal.workflow.simulate import check_new, tables_of
 from margcal.workflow.simulated_node import NOMINAL_SCALE, Field, NodeErrors, readings, true_calibration
 
 TONES = 60
@@ -225,6 +227,37 @@ def simulate_mocap(
     )
     recording = Recording(streams.get("acc"), streams.get("gyr"), streams.get("mag"), source=f"mocap-{seed}")
     return MocapSimulation(recording, reference, replace(truth, alignment=alignment), R_kh, R_nm, motion)
+
+
+def write_mocap(simulation: MocapSimulation, folder: str | Path, *, overwrite: bool = False) -> tuple[Path, Path, Path]:
+    """Write session.parquet, reference.parquet and truth.json (in the frame that `align` gives) into `folder`.
+
+    Returns
+    -------
+    tuple of Path
+        Recording, reference (``t_s ref_qw ... ref_p_x_m ...``), truth (schema of a calibration file).
+
+    Raises
+    ------
+    InputError
+        If one of them exists and `overwrite` is False; nothing is written then.
+    """
+    from margcal.files.calfile import save
+    from margcal.files.tables import write_table
+
+    folder = Path(folder)
+    session, reference, truth = (folder / name for name in ("session.parquet", "reference.parquet", "truth.json"))
+    check_new((session, reference, truth), overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
+    (columns,) = tables_of(simulation.recording).values()  # one clock
+    write_table(session, columns, overwrite=overwrite)
+    seen = simulation.reference
+    columns = {"t_s": seen.t} | {f"ref_q{c}": seen.q[:, i] for i, c in enumerate("wxyz")}
+    if seen.p is not None:
+        columns |= {f"ref_p_{c}_m": seen.p[:, i] for i, c in enumerate("xyz")}
+    write_table(reference, columns, overwrite=overwrite)
+    save(simulation.gyr_symmetric, truth, overwrite=overwrite)
+    return session, reference, truth
 
 
 def gyr_symmetric(calibration: Calibration) -> Calibration:

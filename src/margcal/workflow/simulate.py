@@ -16,7 +16,7 @@ drift and lever arms between the sensors.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -279,12 +279,10 @@ def write_simulation(simulation: Simulation, folder: str | Path, *, overwrite: b
     from margcal.files.tables import write_table
 
     folder = Path(folder)
-    tables = _tables(simulation.recording)
+    tables = tables_of(simulation.recording)
     session = folder / ("session.parquet" if len(tables) == 1 else "session")
     poses, truth = folder / "poses.csv", folder / "truth.json"
-    for path in (session, poses, truth):
-        if path.exists() and not overwrite:
-            raise InputError(f"{path} exists; choose another folder or allow it to be overwritten")
+    check_new((session, poses, truth), overwrite)
     (session if len(tables) > 1 else folder).mkdir(parents=True, exist_ok=True)
     for name, columns in tables.items():
         path = session if len(tables) == 1 else session / f"{name}.parquet"
@@ -298,7 +296,14 @@ def write_simulation(simulation: Simulation, folder: str | Path, *, overwrite: b
     return session, poses, truth
 
 
-def _tables(recording: Recording) -> dict[str, dict[str, Array]]:
+def check_new(paths: Iterable[Path], overwrite: bool) -> None:
+    """Raise `InputError` if one of `paths` exists and may not be overwritten."""
+    for path in paths:
+        if path.exists() and not overwrite:
+            raise InputError(f"{path} exists; choose another folder or allow it to be overwritten")
+
+
+def tables_of(recording: Recording) -> dict[str, dict[str, Array]]:
     """Columns by table: one table if all sensors share a clock, else one a sensor."""
     streams = recording.streams
     clocks = [s.t for s in streams.values()]
