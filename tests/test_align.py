@@ -175,6 +175,12 @@ def test_place_settles_the_magnetometers_sign(sim: MocapSimulation) -> None:
     assert any(i.code == "mirrored-axes" and i.sensor == "mag" for i in found.issues)
 
 
+def test_clock_that_is_not_common_is_named(sim: MocapSimulation) -> None:
+    later = replace(sim.reference, t=sim.reference.t + 7)
+    with pytest.raises(DataError, match=r"not on one clock.* 7\.14 s"):
+        align(sim.recording, later, common_clock=True)
+
+
 def test_no_rotation_is_refused() -> None:
     moved = simulate_mocap(seed=2, acceleration_rms=1.5, rotation=0.0)
     with pytest.raises(DataError, match="correlate"):

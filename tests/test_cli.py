@@ -70,7 +70,8 @@ def test_help_names_every_solver(capsys):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["orient"],  # not built yet: absent
+        ["orient"],
+        ["levitate"],
         ["calibrate"],
         ["calibrate", "x.csv", "--nonsense"],
         ["calibrate", "x.csv", "--gravity", "heavy"],

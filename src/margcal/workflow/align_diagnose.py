@@ -17,7 +17,8 @@ import numpy as np
 from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Issue, Reference, Stream
-from margcal.methods.clock import Synchronisation, synchronise
+from margcal.methods.clock import PEAK, PEAK_APART_S, Synchronisation, synchronise
+from margcal.methods.rate_correlation import correlate
 from margcal.methods.reference_rates import ReferenceRates, reference_rates, resample
 
 GOOD = 0.9
@@ -63,11 +64,13 @@ def synchronised(gyr: Stream, reference: Reference, rates: ReferenceRates, commo
     except DataError as refusal:
         peak = max((i.value or 0.0 for i in refusal.issues if i.code == "no-synchronisation"), default=0.9)
         _refuse_convention(gyr, reference, peak**2, common_clock)
+        _refuse_clock(gyr, rates, common_clock)
         raise
     negative = float(np.linalg.det(sync.T)) < 0
     if sync.explained < GOOD or negative:
         _refuse_convention(gyr, reference, sync.explained, common_clock)
     if sync.explained < LEAST:
+        _refuse_clock(gyr, rates, common_clock)
         text = (
             f"the gyroscope accounts for {100 * max(sync.explained, 0.0):.0f} % of the reference's turning only "
             f"({100 * LEAST:.0f} % is needed), with any convention of its quaternions: is the reference of the same "
@@ -82,6 +85,21 @@ def synchronised(gyr: Stream, reference: Reference, rates: ReferenceRates, commo
         )
         issues.append(Issue("rates-disagree", "warn", text, "gyr", sync.explained, WARNED))
     return Diagnosis(sync, negative, tuple(issues))
+
+
+def _refuse_clock(gyr: Stream, rates: ReferenceRates, common_clock: bool) -> None:
+    """Say so where a clock that is taken for common is not."""
+    if not common_clock:
+        return
+    curve = correlate(gyr.t, gyr.y - np.median(gyr.y, axis=0), rates)
+    k = int(np.argmax(curve.correlation))
+    if curve.correlation[k] < PEAK or abs(curve.lags[k]) < PEAK_APART_S:
+        return
+    text = (
+        f"node and reference are not on one clock: they agree with an offset of {curve.lags[k]:.2f} s (correlation "
+        f"{curve.correlation[k]:.3f}); give the reference as a file of its own, without --common-clock"
+    )
+    raise DataError(text, (Issue("clock-not-common", "fail", text, None, float(curve.lags[k]), PEAK_APART_S),))
 
 
 def _refuse_convention(gyr: Stream, reference: Reference, explained: float, common_clock: bool) -> None:

@@ -126,7 +126,8 @@ def orient(
     late = delays_to_correct(delays, streams, late, recording.source, issues)
     samples = one_clock(streams, late, recording.source, issues)
     rests = find_rests(samples.t, samples.gyr, samples.acc)
-    bias = _bias(rests, samples, chosen, gyro_bias, issues)
+    known = calibration is not None and calibration.gyr is not None
+    bias = _bias(rests, chosen, gyro_bias, known, issues)
     gyr = samples.gyr - bias
     around = surroundings_of(samples.t, samples.acc, samples.mag, rests, issues)
     from_enu = np.array(FRAMES[frame])
@@ -176,11 +177,15 @@ def _check_quaternion(q: Array) -> None:
 # --- the filter ---------------------------------------------------------------------------------------
 
 
-def _bias(rests: Rests, samples: Samples, chosen: Filter, how: str, issues: list[Issue]) -> Array:
-    """Bias of the gyroscope (3,) rad/s from the rests, or zero."""
+def _bias(rests: Rests, chosen: Filter, how: str, calibrated: bool, issues: list[Issue]) -> Array:
+    """What is left of the gyroscope's bias (3,) rad/s: from the rests, or zero."""
     if how not in ("rest", "none"):
         raise UsageError(f"gyro_bias {how!r} is neither rest nor none")
     if how == "none" or chosen.own_bias:
+        return np.zeros(3)
+    if rests.gyr_bias is None and calibrated:
+        text = "no rest to take the gyroscope's bias from: that of the calibration is taken as it is"
+        issues.append(Issue("no-rest", "note", text, "gyr"))
         return np.zeros(3)
     if rests.gyr_bias is None:
         text = (
