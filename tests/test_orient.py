@@ -16,6 +16,7 @@ from margcal.files.calfile import save
 from margcal.files.tables import read, write_table
 from margcal.methods.tracking import GAP, MAG
 from margcal.workflow.orient import FRAMES, orient
+from margcal.workflow.orient_start import find_rests
 from margcal.workflow.simulate import simulate, swing
 
 CODES_OF_NOTE = {"gyro-bias", "heading-drifts", "mag-delay", "drifts"}
@@ -306,3 +307,23 @@ def test_broad_offline_vqf_gains_from_the_magnetometers_delay(data_file):
     assert found.figures["delays_s"]["mag"] == pytest.approx(10.7e-3, abs=2.5e-3)
     assert rms["none"] == pytest.approx(5.24, abs=0.05)
     assert rms["estimate"] < 1.7
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, -2.0, 0.5)])
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_steady_hand_is_no_rest_and_a_bias_of_the_same_rate_is_one(axis, turns):
+    """3 deg/s read by the gyroscope: gravity and field tell whether the node turns."""
+    rng = np.random.default_rng(4)
+    t = np.arange(600) / 200
+    rate = np.radians(3.0) * np.array(axis) / np.linalg.norm(axis)
+    R = so3.exp(rate * t[:, None]) if turns else np.broadcast_to(np.eye(3), (len(t), 3, 3))
+    acc = np.array([0.0, 0.0, 9.81]) @ R + rng.normal(0, 0.03, (len(t), 3))  # rows: R^T f
+    mag = np.array([0.0, 18.0, -44.0]) @ R + rng.normal(0, 0.3, (len(t), 3))
+    gyr = rate + rng.normal(0, 0.003, (len(t), 3))
+    rests = find_rests(t, gyr, acc, mag)
+    assert rests.still.any() != turns
+    if turns:
+        assert rests.gyr_bias is None
+    else:
+        np.testing.assert_allclose(rests.gyr_bias, rate, atol=1e-3)
+        assert not find_rests(t, gyr, acc, mag, calibrated=True).still.any()  # a calibrated one has no such bias

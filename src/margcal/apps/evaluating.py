@@ -16,11 +16,15 @@ from margcal.apps.papers.figures import BLUE, GREY, ORANGE, Curve, Panel, stacke
 from margcal.apps.printing import figure as digits
 from margcal.apps.printing import show_issues
 from margcal.apps.report_svg import envelope, scale_of
+from margcal.core.errors import UsageError
 from margcal.core.types import Array, Mask
 from margcal.workflow.evaluate import ANGLES, Evaluation, error_angles, evaluate
 from margcal.workflow.evaluate_align import LONGEST_GAP, usual_step
 
 FILES = ("evaluation.json", "errors.csv", "evaluation.svg")
+
+OTHER_KINDS = (".json", ".csv", ".html", ".parquet", ".png", ".pdf", ".txt")
+"""Who gives such a name wants one file of that kind, and would find a folder."""
 
 BINS = 380
 """Columns of a panel: longer tracks are drawn as the band between lowest and highest."""
@@ -42,6 +46,8 @@ def run(
 ) -> int:
     """The verb; `output` is a folder, or one picture where it ends in .svg."""
     check_outputs([output], [estimate, reference], overwrite)
+    if output is not None and not _is_picture(output) and Path(output).suffix.lower() in OTHER_KINDS:
+        raise UsageError(f"-o {output}: give a folder (for {', '.join(FILES)}) or a name that ends in .svg")
     with screen.progress("evaluating"):
         found = evaluate(estimate, reference, align_frames=align_frames, align_time=align_time, all_samples=all_samples)
     title = f"{Path(estimate).name} against {Path(reference).name}"

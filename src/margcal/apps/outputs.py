@@ -16,6 +16,8 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str], overwrit
     if len(set(real)) < len(real):
         raise UsageError(f"two results would be written to {given[-1]}; give each a name of its own")
     for path, place in zip(given, real):
+        if not path.strip():
+            raise UsageError("the name of a result is empty; give a file")
         if any(place == os.path.realpath(i) for i in inputs):
             raise UsageError(f"{path} is read and would be overwritten; give the result another name")
         if not overwrite and Path(path).exists() and not _empty_folder(Path(path)):

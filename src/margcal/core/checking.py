@@ -7,6 +7,7 @@ the readings themselves (stuck, saturated, implausible) belong to the lint of th
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -34,6 +35,12 @@ def printable(text: object, limit: int = 200) -> str:
     """`text` for a message: control characters (terminal escapes) become ``?``, long text is cut."""
     safe = "".join(c if c.isprintable() else "?" for c in str(text))
     return safe if len(safe) <= limit else safe[:limit] + "..."
+
+
+def without_options(text: str) -> str:
+    """`text` of a refusal without the options of `calibrate`, for readers that have none of them."""
+    text = text.replace(", or give --skip-bad N", "").replace("give --sort if the rows", "sort the rows if they")
+    return re.sub(r"(\. If it truly is one sample in [^,]*)?, (or )?declare the rate( \([^)]*\))?", "", text)
 
 
 def checked_recording(recording: Recording, *, sort: bool = False, trust_clock: bool = False) -> Recording:

@@ -6,13 +6,14 @@ A column `movement` beside them (0 or 1) says when the body moved. Other columns
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from margcal.core.checking import checked_reference, printable
+from margcal.core.checking import checked_reference, printable, without_options
 from margcal.core.errors import InputError
 from margcal.core.types import Array, Attitude, Issue, Mask, Reference
 from margcal.files.batches import Table, numbers, open_table
@@ -112,7 +113,7 @@ def checked_attitude(t: Array, q: Array, prefix: Prefix, source: str) -> tuple[A
     where = f"{source}: "
 
     def said(text: str) -> str:  # the checks speak of a recording's reference; here an estimate may be meant
-        return text.replace(f"{where}reference", source).replace("ref_q", prefix)
+        return without_options(text.replace(f"{where}reference", source).replace("ref_q", prefix))
 
     try:
         checked, issues = checked_reference(Reference(t, q), where=where)
@@ -135,6 +136,13 @@ def _movement(table: Table) -> tuple[Array, Mask]:
     return values[order, 0], values[order, 1] > 0
 
 
+def _batches(table: Table, index: list[int], take: dict[int, Any]) -> Iterator[Any]:
+    try:
+        yield from table.batches(index, take)
+    except InputError as error:
+        raise InputError(without_options(str(error))) from error
+
+
 def _columns(table: Table, wanted: list[str]) -> Array:
     """The columns (N, k) as numbers; booleans count as 0 and 1."""
     names = _lower(table)
@@ -146,7 +154,7 @@ def _columns(table: Table, wanted: list[str]) -> Array:
     index = [names.index(n) for n in wanted]
     take = {k: "own" if n == "movement" else "number" for k, n in zip(index, wanted)}
     blocks = []
-    for batch in table.batches(index, take):  # type: ignore[arg-type]
+    for batch in _batches(table, index, take):
         try:
             blocks.append(np.column_stack([numbers(batch.column(j)) for j in range(len(index))]))
         except (TypeError, ValueError) as error:

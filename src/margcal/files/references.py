@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from margcal.core.checking import printable
+from margcal.core.checking import printable, without_options
 from margcal.core.errors import InputError
 from margcal.core.types import Reference
 from margcal.files.batches import Table, is_table, open_table
@@ -150,14 +150,17 @@ def _quaternions(table: Table, rate: float | None) -> Reference:
         what = "no reference" if prefix == "q" else f"no {' and '.join(missing)}"
         raise InputError(f"{table.file}: {what} among its columns ({listed}); name them {' '.join(wanted)}")
     if rate is None and "t_s" not in lower:
-        raise InputError(f"{table.file}: no column t_s; name the time in seconds t_s, or declare the rate")
+        raise InputError(f"{table.file}: no column t_s; name the time in seconds t_s")
     groups = {"q": tuple(lower.index(n) for n in wanted)}
     p_columns, factor = _position(lower, table.file)
     if p_columns:
         groups["p"] = p_columns
     if rate is None:
         groups["t"] = (lower.index("t_s"),)
-    values = _load(table, groups, 0, None)
+    try:
+        values = _load(table, groups, 0, None)
+    except InputError as error:
+        raise InputError(without_options(str(error))) from error
     t = np.arange(len(values["q"])) / rate if rate is not None else _time(values["t"][:, 0], table)
     return _reference(t, values["q"], values["p"] * factor if p_columns else None)
 

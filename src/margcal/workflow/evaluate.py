@@ -37,6 +37,9 @@ SLOWER = 1.5
 STEEP_DEG = 85.0
 """Pitch beyond which roll and yaw lose their meaning."""
 
+ODD_DEG, BETTER = 10.0, 5.0
+"""Total error from which other conventions are tried, and how many times less they must leave to be named."""
+
 ANGLES = ("roll", "pitch", "yaw")
 
 
@@ -161,7 +164,7 @@ def evaluate(
         frames, found = turned(q_est[counted], q_ref[counted], align_frames)
         q_est = so3.quat_multiply(so3.quat_multiply(frames.laboratory, q_est), frames.body)
         issues += found
-    issues += _steep(q_ref[counted])
+    issues += [*_alike(q_est, q_ref), *_otherwise(q_est[counted], q_ref[counted]), *_steep(q_ref[counted])]
     return _judged(t, q_est, q_ref, counted, samples, times, (offset, correlation), frames, issues)
 
 
@@ -216,6 +219,9 @@ def _common(
     est: AttitudeTable, ref: AttitudeTable, offset: float
 ) -> tuple[Literal["estimate", "reference"], Array, Array, Array]:
     """Whose times, the times on the reference's clock, and both tracks at them."""
+    for track in (est, ref):
+        if not np.isfinite(track.attitude.q).all(axis=1).any():
+            raise DataError(f"{track.source}: no sample holds an attitude: all are empty or (0, 0, 0, 0)")
     a = Attitude(est.attitude.t + offset, est.attitude.q)
     b = ref.attitude
     if usual_step(b.t) > SLOWER * usual_step(a.t):
@@ -247,6 +253,38 @@ def _counted(t: Array, moved: tuple[Array, Mask] | None) -> tuple[Mask, Literal[
             "(--all-samples)"
         )
     return counted, "movement"
+
+
+def _alike(q_est: Array, q_ref: Array) -> list[Issue]:
+    """Not one digit of difference: nothing was estimated."""
+    if not (np.array_equal(q_est, q_ref) or np.array_equal(q_est, -q_ref)):
+        return []
+    text = "estimate and reference are the same numbers to the last digit: a track was compared with itself"
+    return [Issue("same-track", "warn", text)]
+
+
+def _otherwise(q_est: Array, q_ref: Array) -> list[Issue]:
+    """Is the estimate right when its quaternions are read otherwise? Then its convention is wrong, not the filter."""
+    last = np.roll(q_est, 1, axis=1)
+    readings = {
+        "conjugated (earth to body)": so3.quat_conjugate(q_est),
+        "scalar last": last,
+        "scalar last and conjugated": so3.quat_conjugate(last),
+    }
+    given = _total_deg(q_est, q_ref)
+    found = {name: _total_deg(q, q_ref) for name, q in readings.items()}
+    best = min(found, key=lambda name: found[name])
+    if given < ODD_DEG or found[best] * BETTER > given:
+        return []
+    text = (
+        f"read {best}, the estimate's quaternions are off by {found[best]:.3g} degrees instead of {given:.3g}: one of "
+        "the two files is of that convention; margcal's is scalar first, body to earth"
+    )
+    return [Issue("convention", "warn", text, value=found[best], limit=given / BETTER)]
+
+
+def _total_deg(q_est: Array, q_ref: Array) -> float:
+    return float(np.degrees(np.sqrt(np.mean(error_angles(q_est, q_ref)[0] ** 2))))
 
 
 def _steep(q_ref: Array) -> list[Issue]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from margcal.core.errors import DataError, UsageError
 from margcal.core.types import Array, Calibration, Issue
-from margcal.core.units import KINDS, Kind
+from margcal.core.units import KINDS, UNITS, Kind
 from margcal.files.exchange.fitting import ORIENTATIONS, lower_frame, nearest, orientation_of
 from margcal.files.exchange.target import Form, Matrix, Page, Sensor, Target
 from margcal.methods.uncertainty import direction_errors_deg, sphere
@@ -22,6 +22,12 @@ from margcal.workflow.export_units import Converted, converted, field_strength
 
 MAX_LOSS_DEG = 0.5
 """Largest direction error, rms, that an export may cost without being told to."""
+
+FIELD_UT = (1.0, 1000.0)
+"""Strengths of the field that are taken, uT."""
+
+FOREIGN_SCALE = 3.0
+"""A data sheet is off by a few percent, a unit by 9.8, 57.3 or 100."""
 
 NOTHING_DEG = 1e-9
 """Below this an angle is a rounding error of float64."""
@@ -106,7 +112,11 @@ def export(
     UsageError
         Options that do not fit the target.
     """
+    _refuse_odd_limits(max_loss_deg, field_uT)
     kinds, left_out = _chosen(calibration, target, sensors)
+    _refuse_foreign_scale(
+        calibration, [k for k in kinds if "count" not in (target.forms[k].raw or ("count",))], scale, field_uT
+    )
     models: dict[Kind, Converted] = {
         k: converted(calibration, k, target.forms[k], target.name, scale, field_uT) for k in kinds
     }
@@ -158,6 +168,37 @@ def _chosen(
     if missing := [k for k in target.required if k not in kinds]:
         raise DataError(f"{target.name} needs {' and '.join(target.required)}; {missing[0]} is not there")
     return kinds, tuple(k for k in wanted if k not in kinds)
+
+
+def _refuse_odd_limits(max_loss_deg: float, field_uT: float | None) -> None:
+    """NaN is no limit: nothing would be above it."""
+    if not max_loss_deg >= 0:
+        raise UsageError(f"--max-loss is {max_loss_deg:g}; give degrees, 0 or more")
+    if field_uT is not None and not FIELD_UT[0] <= field_uT <= FIELD_UT[1]:
+        raise UsageError(
+            f"--field is {field_uT:g} uT; on the earth it lies between {FIELD_UT[0]:g} and {FIELD_UT[1]:g}"
+        )
+
+
+def _refuse_foreign_scale(
+    calibration: Calibration,
+    kinds: Collection[Kind],
+    scale: Mapping[str, float] | None,
+    field_uT: float | None,
+) -> None:
+    """A scale that is far from what was calibrated was given in another unit: g for m/s^2, degrees for rad/s."""
+    for kind in kinds:
+        told, own = (scale or {}).get(kind), calibration.models[kind]
+        field = field_strength(calibration, field_uT) if own.unit == "norm" else 1.0
+        if told is None or field is None or UNITS[kind].get(own.raw_unit) is not None:
+            continue
+        measured = float(np.cbrt(abs(np.linalg.det(own.H)))) * field
+        if not 1 / FOREIGN_SCALE <= told / measured <= FOREIGN_SCALE:
+            unit = "uT" if kind == "mag" else own.unit
+            raise UsageError(
+                f"--scale {kind}={told:g} is {told / measured:.3g} times what was calibrated, {measured:.4g} {unit} a "
+                f"{own.raw_unit}; give it in {unit} a {own.raw_unit}"
+            )
 
 
 def _refuse_idle_options(

@@ -16,6 +16,7 @@ from margcal.core.errors import DataError, InputError, UsageError
 from margcal.core.types import Array, Calibration, Issue, SensorModel
 from margcal.core.units import KINDS, SI_COLUMN, SI_UNIT, UNITS, Kind
 from margcal.files.calfile import check_model
+from margcal.files.exchange import texts
 from margcal.files.exchange.target import MAX_BYTES, Form, Page, Sensor, Target
 
 VECTORS_AGREE = 1e-6
@@ -60,9 +61,18 @@ def import_calibration(
     """
     if len(data) > MAX_BYTES:
         raise InputError(f"{name}: is larger than {MAX_BYTES // 1000} kB; this is no calibration")
+    for option, given in (("--units", units), ("--unit", unit), ("--scale", scale)):
+        if wrong := [k for k in given or () if k not in KINDS]:
+            raise UsageError(f"{option}: {printable(wrong[0], 40)!r} is no sensor; acc, gyr and mag are")
     page = source.read(data, name, tuple(sensors))
     if absent := [k for k in sensors if k not in page.sensors]:
         raise DataError(f"{name}: {absent[0]} is not in it; it holds {', '.join(page.sensors)}")
+    cut = [k for k in texts.announced(data.decode("utf-8", "replace")) if k not in page.sensors]
+    if cut and not sensors:
+        raise InputError(
+            f"{name}: names {cut[0]} but does not hold its numbers: it was cut or damaged; export it again, or, "
+            f"if you took it out yourself, give --sensors {','.join(page.sensors)}"
+        )
     models, issues = {}, []
     for kind in KINDS:
         sensor = page.sensors.get(kind)
@@ -71,7 +81,8 @@ def import_calibration(
         told = {k: (v or {}).get(kind) for k, v in (("raw", units), ("unit", unit), ("scale", scale))}
         models[kind] = _model(kind, sensor, source.forms[kind], told, name, source.name)
         issues += _issues(kind, sensor, source)
-    where = frame or _frame(page)
+    along_raw_axes = any(source.forms[k].nominal for k in models)
+    where = frame or (UNKNOWN_FRAME if along_raw_axes else _frame(page))
     if where == UNKNOWN_FRAME:
         text = "the file does not say along which axes it calibrates; name them with --frame if you know"
         issues.append(Issue("frame-unknown", "note", text))
@@ -186,6 +197,9 @@ def _issues(kind: Kind, sensor: Sensor, source: Target) -> list[Issue]:
     found = []
     if sensor.dropped:
         found.append(Issue("term-dropped", "warn", f"{kind}: {sensor.dropped}; it was left out", kind))
+    if source.forms[kind].nominal:
+        text = f"{kind}: {source.name} files hold the bias only; H is the scale that was told, along the raw axes"
+        found.append(Issue("nominal-scale", "warn", text, kind))
     if not source.forms[kind].bias:
         text = f"{kind}: {source.name} files hold no bias; B is zero, calibrate it or have your filter estimate it"
         found.append(Issue("bias-missing", "warn", text, kind))

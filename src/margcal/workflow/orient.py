@@ -125,8 +125,8 @@ def orient(
         streams.pop("mag", None)
     late = delays_to_correct(delays, streams, late, recording.source, issues)
     samples = one_clock(streams, late, recording.source, issues)
-    rests = find_rests(samples.t, samples.gyr, samples.acc)
     known = calibration is not None and calibration.gyr is not None
+    rests = find_rests(samples.t, samples.gyr, samples.acc, samples.mag, calibrated=known)
     bias = _bias(rests, chosen, gyro_bias, known, issues)
     gyr = samples.gyr - bias
     around = surroundings_of(samples.t, samples.acc, samples.mag, rests, issues)

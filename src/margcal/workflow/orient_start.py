@@ -16,8 +16,12 @@ WINDOW_S = 0.5
 """Length of the stretches that are looked at for rest."""
 GYR_STILL, ACC_STILL = 0.03, 0.15
 """Scatter (rad/s, m/s^2) of a window at rest: several times that of any MEMS node on a table, and a hand shows more."""
-GYR_SLOW = 0.15
-"""Mean rate (rad/s) of a window at rest: the bias of a gyroscope that was never calibrated."""
+GYR_SLOW, GYR_SLOW_CALIBRATED = 0.15, 0.02
+"""Mean rate (rad/s) of a window at rest: the bias of a gyroscope that was never calibrated, and what is left of one."""
+TOGETHER = 6
+"""Windows in a row over which a turn is told from a bias."""
+INDEPENDENT = 8
+"""Samples of a sensor that count as one reading: it may be slower than the gyroscope, or filtered."""
 LEAST_S = 1.0
 """Seconds of rest from which a bias is taken."""
 AT_START_S = 3.0
@@ -44,8 +48,12 @@ class Rests:
     seconds: float
 
 
-def find_rests(t: Array, gyr: Array, acc: Array) -> Rests:
-    """Stretches in which the node lies still."""
+def find_rests(t: Array, gyr: Array, acc: Array, mag: Array, *, calibrated: bool = False) -> Rests:
+    """Stretches in which the node lies still.
+
+    A steady hand turns as evenly as a gyroscope's bias: where gravity or the field turn in the node's axes as the
+    gyroscope says, it is no rest. A `calibrated` gyroscope has little bias left.
+    """
     period = (t[-1] - t[0]) / (len(t) - 1) if len(t) > 1 else 0.0
     width = max(4, math.ceil(WINDOW_S / period)) if period > 0 else len(t) + 1
     count = len(t) // width
@@ -57,13 +65,52 @@ def find_rests(t: Array, gyr: Array, acc: Array) -> Rests:
     first, last = t[rows].reshape(count, width)[:, 0], t[rows].reshape(count, width)[:, -1]
     mean = w.mean(axis=1)
     still = np.max(np.abs(w - mean[:, None]).max(axis=1), axis=1) < 5 * GYR_STILL
-    still &= (w.std(axis=1).max(axis=1) < GYR_STILL) & (np.abs(mean).max(axis=1) < GYR_SLOW)
+    slow = GYR_SLOW_CALIBRATED if calibrated else GYR_SLOW
+    still &= (w.std(axis=1).max(axis=1) < GYR_STILL) & (np.abs(mean).max(axis=1) < slow)
     if np.isfinite(a).any():
         still &= a.std(axis=1).max(axis=1) < ACC_STILL
     still &= last - first < 2 * WINDOW_S  # no gap inside
+    if still.any():
+        half = (last - first) / 4
+        middle = (first + last) / 2
+        vectors = (a, mag[rows].reshape(count, width, 3))
+        still &= ~_turning(still, mean, middle, (middle - half, middle + half), vectors)
     seconds = float(np.sum((last - first)[still])) + np.count_nonzero(still) * period
     bias = _middle(mean[still]) if seconds >= LEAST_S else None
     return Rests(first, last, still, bias, seconds)
+
+
+def _turning(still: Mask, rate: Array, middle: Array, halves: tuple[Array, Array], vectors: tuple[Array, ...]) -> Mask:
+    """Windows (M,) in which fixed vectors (M, n, 3) turn as `rate` (M, 3) says, told over up to `TOGETHER` in a row.
+
+    v' = -rate x v: the share of that which is seen is 1 in a turn and 0 at rest; half is the limit, where the scatter
+    lets it be told (four standard errors from 0). v' is the slope of a line through the means of the windows' halves.
+    """
+    new = np.diff(np.flatnonzero(still), prepend=-2) != 1
+    place = np.arange(len(new)) - np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))
+    block = np.cumsum(place % TOGETHER == 0) - 1
+    count = np.bincount(block)
+
+    def mean(x: Array) -> Array:
+        """Means (K, 3) over the blocks of rows (m, 3) of the windows at rest."""
+        return np.stack([np.bincount(block, c) / count for c in x.T], axis=-1)
+
+    lever = [(t[still] - mean(middle[still, None])[block, 0]) for t in halves]
+    square = np.bincount(block, lever[0] ** 2 + lever[1] ** 2)
+    told, weight = np.zeros(len(count)), np.zeros(len(count))
+    for v in vectors:
+        n = v.shape[1] // 2
+        parts = v[still, :n].mean(axis=1), v[still, -n:].mean(axis=1)
+        slope = mean(parts[0] * lever[0][:, None] + parts[1] * lever[1][:, None]) * (count / square)[:, None]
+        expected = -np.cross(mean(rate[still]), mean((parts[0] + parts[1]) / 2))
+        scatter = mean(v[still].var(axis=1)).mean(axis=1) * INDEPENDENT / max(n, INDEPENDENT)
+        here = np.sum(expected**2, axis=1) * square / (scatter + 1e-300)
+        known = np.isfinite(here)
+        told += np.where(known, np.sum(expected * slope, axis=1) * square / (scatter + 1e-300), 0.0)
+        weight += np.where(known, here, 0.0)
+    turning = np.zeros(len(still), dtype=bool)
+    turning[still] = ((told > 0.5 * weight) & (told > 4 * np.sqrt(weight)))[block]
+    return turning
 
 
 def surroundings_of(t: Array, acc: Array, mag: Array, rests: Rests, issues: list[Issue]) -> Surroundings:

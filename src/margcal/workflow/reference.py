@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from margcal.core import so3
-from margcal.core.checking import _continuous, _runs, checked_reference
+from margcal.core.checking import _continuous, _runs, checked_reference, without_options
+from margcal.core.errors import InputError
 from margcal.core.rigid_body import MarkerReference
 from margcal.core.types import Array, Issue, Mask, Reference, Stream
 
@@ -109,7 +110,10 @@ def clean_reference(
     InputError
         As `core.checking.checked_reference`: norms off by more than 5e-2, infinite values, time that runs backwards.
     """
-    checked, first = checked_reference(reference, where=_prefix(where))
+    try:
+        checked, first = checked_reference(reference, where=_prefix(where))
+    except InputError as error:
+        raise InputError(without_options(str(error))) from error
     t, q = checked.t, checked.q.copy()
     p = None if checked.p is None else checked.p.copy()
     kept = np.concatenate([[True], np.diff(reference.t) > 0])

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from margcal.core.checking import printable
 from margcal.core.errors import DataError, InputError
 from margcal.core.types import Array
 from margcal.core.units import Kind
@@ -113,11 +114,17 @@ def _write_ggir(page: Page) -> bytes:
 
 def _read_ggir(data: bytes, name: str, kinds: tuple[Kind, ...]) -> Page:
     try:
-        rows = [r for r in csv.DictReader(io.StringIO(texts.decode(data, name))) if r]
+        table = csv.DictReader(io.StringIO(texts.decode(data, name)))
+        rows = [r for r in table if r]
     except csv.Error as error:
         raise InputError(f"{name}: is no CSV table ({error})") from error
+    header = [h.strip().lower() for h in table.fieldnames or ()]
+    if twice := [h for h in header if header.count(h) > 1]:
+        raise InputError(f"{name}: column {printable(twice[0], 60)!r} is there twice; keep one")
     if len(rows) != 1:
         raise InputError(f"{name}: has {len(rows)} rows; one is one calibration: keep the row of your device")
+    if None in rows[0] or None in rows[0].values():
+        raise InputError(f"{name}: the row has not as many cells as the header; it was cut or damaged")
     lower = {str(k).strip().lower(): v for k, v in rows[0].items() if k}
     fields: dict[str, Array] = {}
     for key in ("scale", "offset", "temperature.offset"):

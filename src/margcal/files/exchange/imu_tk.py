@@ -46,7 +46,7 @@ def _write(page: Page) -> bytes:
 
 
 def _read(data: bytes, name: str, kinds: tuple[Kind, ...]) -> Page:
-    if len(kinds) != 1:
+    if len(kinds) != 1 or kinds[0] not in FORMS:
         raise InputError(f"{name}: an imu_tk file does not say which sensor it is of; give --sensors acc or gyr")
     words = texts.decode(data, name).split()[:21]
     try:

@@ -173,4 +173,5 @@ def identifier(text: object) -> str:
 
 def single_precision(a: Any) -> Array:
     """`a` rounded to float32, as float64."""
-    return np.asarray(a, dtype=np.float64).astype(np.float32).astype(np.float64)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+        return np.asarray(a, dtype=np.float64).astype(np.float32).astype(np.float64)

@@ -87,6 +87,12 @@ def units_in(text: str) -> dict[Kind, tuple[str, str]]:
     return {k: (m[2], m[3]) for m in _UNITS.finditer(text) for k in KINDS if m[1] == k}
 
 
+def announced(text: str) -> list[Kind]:
+    """The sensors that the unit lines of a file of ours name; a name or remark within a line is none."""
+    found = re.findall(r"^[ *#%/]{0,8}margcal units: (acc|gyr|mag) takes", text, re.MULTILINE)
+    return [k for k in KINDS if k in found]
+
+
 def vectors_in(text: str) -> dict[Kind, tuple[Array, Array]]:
     """Test vectors from the comments of a file of ours."""
     found: dict[Kind, list[tuple[list[float], list[float]]]] = {}
