@@ -16,7 +16,7 @@ from margcal.apps.calibrating import as_plain, parse_sensors, read_one
 from margcal.apps.outputs import check_outputs
 from margcal.core import so3
 from margcal.core.errors import DataError, InputError
-from margcal.core.types import Calibration, Recording, Reference
+from margcal.core.types import Calibration, Issue, Recording, Reference
 from margcal.workflow.align import align
 from margcal.workflow.align_job import MocapAlignment
 
@@ -101,7 +101,8 @@ def _aligned(node: Recording, asked: Mapping[str, Any]) -> tuple[Calibration, st
             try:
                 found = align(node, **asked, allow_fail=True, tick=tick)
             except DataError:  # refused before any sensor was looked at
-                issues = (*node.issues, *refused.issues)
+                reasons = refused.issues or (Issue("refused", "fail", str(refused)),)
+                issues = (*node.issues, *reasons)
                 found = Calibration(device=asked.get("device"), verdict="fail", issues=issues, recordings=(node,))
     if failure is None and found.verdict == "fail":
         failure = "the verdict is fail: " + "; ".join(i.text for i in found.issues if i.level == "fail")

@@ -148,14 +148,13 @@ def no_before(calibration: Calibration) -> str:
 
 
 def orientation_figure(
-    before: OrientationErrors | None, after: OrientationErrors | None, figures: AlignFigures, clock: tuple[float, float]
+    before: OrientationErrors | None, after: OrientationErrors | None, figures: AlignFigures
 ) -> str:
-    """Orientation error over time; `clock` is offset (s) and rate that take the node's time to the reference's."""
+    """Orientation error over time."""
     panels = []
     for name, errors in (("before", before), ("after", after)):
         if errors is not None and len(errors.t):
-            t = clock[0] + clock[1] * np.asarray(errors.t)
-            panels.append(Panel(f"Orientation error {name}, °", t, ((name, np.asarray(errors.error)),), zero=True))
+            panels.append(Panel(f"Orientation error {name}, °", errors.t, ((name, errors.error),), zero=True))
     return stacked(panels, span_of(figures), figures.masked, "Orientation error over time") if panels else ""
 
 

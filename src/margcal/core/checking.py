@@ -39,6 +39,7 @@ def printable(text: object, limit: int = 200) -> str:
 
 def without_options(text: str) -> str:
     """`text` of a refusal without the options of `calibrate`, for readers that have none of them."""
+    text = text.replace(", empty the cell, or give --skip-bad N", " or empty the cell")
     text = text.replace(", or give --skip-bad N", "").replace("give --sort if the rows", "sort the rows if they")
     return re.sub(r"(\. If it truly is one sample in [^,]*)?, (or )?declare the rate( \([^)]*\))?", "", text)
 

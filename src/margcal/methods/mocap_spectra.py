@@ -196,13 +196,19 @@ class Band:
 
 
 def band(track: Track, f_max: float) -> Band:
-    """The band of `track` up to `f_max` Hz."""
-    n = len(track.t) + len(track.t) % 2
+    """The band of `track` up to `f_max` Hz, padded with zeros to a length whose transform is fast."""
+    n = _fast_length(len(track.t))
     f = np.asarray(np.fft.rfftfreq(n, track.step), dtype=np.float64)
     share = np.full(len(f), 2.0 / n)
     share[0] = share[-1] = 1.0 / n
     keep = f <= f_max
     return Band(f[keep], share[keep], n, track.step)
+
+
+def _fast_length(least: int) -> int:
+    """The smallest even number from `least` on without a prime factor above 5: large ones cost fifteen times as much."""
+    odd = (3**b * 5**c for b in range(16) for c in range(11))
+    return min(m << max(1, (-(-least // m) - 1).bit_length()) for m in odd)
 
 
 def products(track: Track, win: Window, b: Band, z: Array) -> Spectra:

@@ -19,7 +19,9 @@ import numpy as np
 from margcal.core.errors import DataError, InputError, UsageError
 from margcal.core.types import Array, Calibration, Issue, Kind, Recording, Reference, Stream, Verdict
 from margcal.core.units import KINDS, STANDARD_GRAVITY
+from margcal.methods.clock import Synchronisation
 from margcal.methods.r_bsn import polar_split
+from margcal.methods.rate_correlation import LEAST_OVERLAP_S
 from margcal.methods.reference_rates import reference_rates
 from margcal.workflow import align_diagnose
 from margcal.workflow.align_checks import Check, checks_of, failed_sensors, with_expected_error
@@ -44,6 +46,10 @@ from margcal.workflow.segment import measured
 
 if TYPE_CHECKING:
     from margcal.workflow.place import Place
+
+LEAST_SAMPLES = 20
+DRIFTED_DEG_S, FOREIGN_DEG_S = 1.0, 5.0
+"""Difference of the bias at rest and in motion that is warned of, and that no bias drifts by in a day."""
 
 STILL = 0.2
 """A trial at rest must turn less than this part of the moved one (rms)."""
@@ -219,10 +225,16 @@ def _job(
     reference, found = clean_reference(reference, gyr=gyr if common else None)
     issues += found
     say(1, 9)
+    for what, t in (("reference", reference.t), ("gyroscope", gyr.t)):
+        if len(t) < LEAST_SAMPLES or np.ptp(t) < LEAST_OVERLAP_S:
+            text = f"the {what} has {len(t)} samples in {np.ptp(t):.1f} s, which is too short: record a minute"
+            raise DataError(text, (Issue("too-short", "fail", text),))
     rates = reference_rates(reference)
     bias = None if static is None else _static_bias(static, gyr)
     diagnosis = align_diagnose.synchronised(gyr, reference, rates, common)
     sync = diagnosis.sync
+    if static is not None and bias is not None:
+        issues += _foreign_static(static, bias[0], sync)
     issues += diagnosis.issues
     raw, axis = recording, None
     if diagnosis.mirrored:
@@ -252,6 +264,30 @@ def _static_bias(static: Recording, moved: Stream) -> tuple[Array, Array]:
         raise DataError(text, (Issue("static-moved", "fail", text, "gyr"),))
     parts = np.array([p.mean(axis=0) for p in np.array_split(y, max(4, min(40, len(y) // 50)))])
     return y.mean(axis=0), np.std(parts, axis=0) / 2 + np.std(y, axis=0) / np.sqrt(len(y)) + 1e-12
+
+
+def _foreign_static(static: Recording, bias: Array, sync: Synchronisation) -> list[Issue]:
+    """Is the bias at rest that of the moved trial? Then ``T b + c`` of (16) is nothing.
+
+    Raises
+    ------
+    DataError
+        If it is a turn that no drift of a bias makes: another node, or a trial that was not at rest.
+    """
+    rows = np.hstack([np.kron(np.eye(3), bias), np.eye(3)])
+    miss = np.abs(sync.T @ bias + sync.c)
+    sure = np.degrees(float(np.max(miss - 5 * np.sqrt(np.maximum(np.diag(rows @ sync.covariance @ rows.T), 0.0)))))
+    if sure < DRIFTED_DEG_S:
+        return []
+    level: Literal["warn", "fail"] = "fail" if sure > FOREIGN_DEG_S else "warn"
+    text = (
+        f"{static.source}: at rest the gyroscope's bias is {np.degrees(miss.max()):.2f} deg/s off what the moved trial "
+        "shows: give a trial at rest of the same node and day, or leave --static out"
+    )
+    issue = Issue("static-bias", level, text, "gyr", float(np.degrees(miss.max())), DRIFTED_DEG_S)
+    if level == "fail":
+        raise DataError(text, (issue,))
+    return [issue]
 
 
 # --- the result -----------------------------------------------------------------------------------------

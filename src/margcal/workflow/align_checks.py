@@ -75,7 +75,8 @@ def _clock(job: AlignJob) -> Iterable[Check]:
         yield Check("common-clock", "gyr", off, 0.1, "warn" if off > 0.1 else "pass", text)
         return
     drift = abs(sync.drift_ppm)
-    text = f"the node's clock runs {sync.drift_ppm:+.1f} +- {sync.drift_se_ppm:.1f} ppm against the reference's"
+    pace = "slow" if sync.drift_ppm > 0 else "fast"  # t_ref = offset + (1 + drift) t_node
+    text = f"the node's clock is {drift:.1f} +- {sync.drift_se_ppm:.1f} ppm {pace} against the reference's"
     if drift > DRIFT_PPM:
         text += f" (limit {DRIFT_PPM:g}): is the rate of one of them wrong? The drift is taken into account"
     yield Check("clock-drift", None, drift, DRIFT_PPM, "warn" if drift > DRIFT_PPM else "pass", text)

@@ -114,7 +114,8 @@ def _refuse_convention(gyr: Stream, reference: Reference, explained: float, comm
 def _explained(gyr: Stream, reference: Reference, common_clock: bool) -> float:
     try:
         rates = reference_rates(reference)
-        return synchronise(gyr.t, gyr.y, rates, common_clock=common_clock, peak_needed=0.0).explained
+        # a short stretch, or one that stands still, fits anything somewhere: it must correlate as well
+        return synchronise(gyr.t, gyr.y, rates, common_clock=common_clock).explained
     except DataError:
         return 0.0
 

@@ -62,14 +62,13 @@ def _told(before: OrientationErrors | None, after: OrientationErrors, chosen: st
 
 
 def _judged(job: AlignJob, found: Attitude, text: str, R_nm: Array, R_kh: Array) -> OrientationErrors | None:
-    R = R_nm @ attitude_at(job.reference, job.sync.reference_time(found.t)) @ R_kh
+    t = job.sync.reference_time(found.t)
+    R = R_nm @ attitude_at(job.reference, t) @ R_kh
     seen = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(found.q).all(axis=1) & (found.t > found.t[0] + SETTLE_S)
     if np.count_nonzero(seen) < 100:
         return None
     total, heading, inclination = (np.degrees(a) for a in error_angles(found.q[seen], so3.quat_from_matrix(R[seen])))
-    return OrientationErrors(
-        _rms(total), _rms(heading), _rms(inclination), thinned(found.t[seen]), thinned(total), text
-    )
+    return OrientationErrors(_rms(total), _rms(heading), _rms(inclination), thinned(t[seen]), thinned(total), text)
 
 
 def _rms(x: Array) -> float:

@@ -82,7 +82,8 @@ class OrientationErrors:
     """The orientation that a filter makes of the node's readings against the optics, degrees.
 
     `total`, `heading`, `inclination` are root mean squares over the samples that the optics saw, as in `evaluate`;
-    `t` (n,) s, `error` (n,) deg is the total error over time (thinned). `text` says what was compared.
+    `t` (n,) s, the reference's clock, `error` (n,) deg: the total error over time (thinned). `text` says what was
+    compared.
     """
 
     total: float
