@@ -216,14 +216,11 @@ def _residual_row(calibration: Calibration, kind: Kind) -> list[str]:
 
 def orientation(calibration: Calibration) -> str:
     """What a filter makes of the readings before and after, against the optics."""
-    figures, alignment = figures_of(calibration), calibration.alignment
-    if figures is None or alignment is None or (figures.before is None and figures.after is None):
+    figures = figures_of(calibration)
+    if figures is None or (figures.before is None and figures.after is None):
         return ""
     before, after = figures.before, figures.after
-    offset, drift = (
-        0.0 if alignment.common_clock else _number(alignment.values.get(n)) for n in ("offset_s", "drift_ppm")
-    )
-    picture = orientation_figure(before, after, figures, (offset or 0.0, 1 + 1e-6 * (drift or 0.0)))
+    picture = orientation_figure(before, after, figures)
     told_of = [
         f"<strong>{name}:</strong> {esc(e.text)}."
         for name, e in (("Before", before), ("After", after))

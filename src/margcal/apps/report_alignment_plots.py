@@ -147,9 +147,7 @@ def no_before(calibration: Calibration) -> str:
     return '<p class="note">Before: not drawn, because raw counts say nothing of °/s until they are calibrated.</p>'
 
 
-def orientation_figure(
-    before: OrientationErrors | None, after: OrientationErrors | None, figures: AlignFigures
-) -> str:
+def orientation_figure(before: OrientationErrors | None, after: OrientationErrors | None, figures: AlignFigures) -> str:
     """Orientation error over time."""
     panels = []
     for name, errors in (("before", before), ("after", after)):

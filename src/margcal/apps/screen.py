@@ -109,13 +109,14 @@ class _Bar:
 
     def _start(self) -> None:
         from rich.console import Console
+        from rich.markup import escape
         from rich.progress import Progress
 
         with self.lock:
             if self.closed:
                 return
             self.bar = Progress(console=Console(stderr=True, markup=False), transient=True)
-            self.bar.add_task(self.label, total=self.total or None, completed=self.done)
+            self.bar.add_task(escape(self.label), total=self.total or None, completed=self.done)
             self.bar.start()
 
     def tick(self, done: int, total: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from margcal.core import rigid_body, so3
-from margcal.core.checking import printable
+from margcal.core.checking import printable, without_options
 from margcal.core.errors import InputError
 from margcal.core.rigid_body import MarkerReference
 from margcal.core.types import Array
@@ -135,13 +135,18 @@ def markers_of(
     if table.size > max_bytes:
         raise InputError(f"{table.file}: {table.size / 1e9:.1f} GB is more than is read into memory; cut it")
     lower = [n.strip().lower() for n in table.names]
+    if twice := [n for n in lower if n and lower.count(n) > 1]:
+        raise InputError(f"{table.file}: column name {printable(twice[0])!r} is there twice; rename one")
     if "t_s" not in lower and rate is None:
         raise InputError(f"{table.file}: no column t_s; name the time in seconds t_s, or declare the frame rate")
     factors = {name: _unit_of(name, axes, unit, table.file) for name, axes in columns.items()}
     groups = {name: tuple(axes[a][0] for a in "xyz") for name, axes in columns.items()}
     if rate is None:
         groups["t_s"] = (lower.index("t_s"),)
-    values = _load(table, groups, 0, None)
+    try:
+        values = _load(table, groups, 0, None)
+    except InputError as error:
+        raise InputError(without_options(str(error))) from error
     x = np.stack([values[name] * factors[name] for name in columns], axis=1)
     t = np.arange(len(x)) / rate if rate is not None else _time(values["t_s"][:, 0], table)
     return _masked(Markers(tuple(printable(n, 80) for n in columns), t, x, table.file))

@@ -8,13 +8,12 @@ one more unknown (Gauss-Newton), errors by leaving out one of 24 stretches of th
   place) says nothing of time and would only disturb.
 * Accelerometer (`accelerometer_delay`): in the laboratory, ``R (H y(t + d) - o) = f + p'' + R'' r``. p'' and R'' are
   second derivatives of local polynomials, that is a smoothed p''; the left side goes through the same smoothing, whose
-  weights are those of the second derivative summed up twice. Without positions (`delay_of_lowest`): the delay at which
-  the low-passed fit leaves least.
+  weights are those of the second derivative summed up twice. Without positions the low-passed fit has the delay as one
+  more unknown (`mocap_solve`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,10 +27,6 @@ APART_S = 0.15
 """Readings that are subtracted from each other are this far apart."""
 STEP_S = 0.002
 """Half step of a derivative by time."""
-REACH_S = 0.018
-"""Delays up to this far from the gyroscope's are looked for by their cost."""
-FLOOR_S = 3e-4
-"""What the low-pass leaves of a bias in such a delay, measured in simulation over ten minutes."""
 FARTHEST_S = 0.05
 """Longest step of d in one round."""
 SETTLED_S = 1e-5
@@ -144,41 +139,6 @@ def accelerometer_delay(
         if k and abs(change) < SETTLED_S:
             break
     return _told(d, rows, target, w[good], x)
-
-
-def delay_of_lowest(cost: Callable[[float], float], *, start: float, freedom: float) -> SensorDelay:
-    """The delay at which a sum of squares is lowest, within `REACH_S` of `start`.
-
-    Parameters
-    ----------
-    cost : callable
-        Delay (s) -> sum of squares of a fit with it.
-    freedom : float
-        Independent equations behind the sum less unknowns: the error of the delay follows from the curvature.
-
-    Returns
-    -------
-    SensorDelay
-        `se_s` is infinite where the lowest is at the end of the reach; `explained` the part of the cost at `start` that
-        the delay takes away.
-    """
-    tried = {start + float(s): cost(start + float(s)) for s in np.linspace(-REACH_S, REACH_S, 7)}
-    step = REACH_S / 3
-    for _ in range(3):
-        best = min(tried, key=lambda d: tried[d])
-        step /= 2
-        for d in (best - step, best + step):
-            tried.setdefault(d, cost(d))
-    best = min(tried, key=lambda d: tried[d])
-    if abs(best - start) > REACH_S:
-        return SensorDelay(best, float("inf"), 0.0)
-    low, middle, high = cost(best - step), tried[best], cost(best + step)
-    bend = (low - 2 * middle + high) / step**2
-    if not bend > 0:
-        return SensorDelay(best, float("inf"), 0.0)
-    d = best - float(np.clip((high - low) / (2 * step) / bend, -step, step))
-    se = float(np.hypot(np.sqrt(2 * middle / max(freedom, 1.0) / bend), FLOOR_S))
-    return SensorDelay(float(d), se, 1 - middle / max(tried[start], 1e-300))
 
 
 class _Smoothing:

@@ -52,12 +52,20 @@ class Filter(NamedTuple):
     corrects: bool = True
 
 
+MISSED = 2.5
+"""Usual steps without a sample that are a gap where the sensor is slow; at 10 Hz and above a quarter of a second is."""
+
+
+def _gap(s: Surroundings) -> float:
+    return max(strapdown.Params().gap, MISSED * s.period)
+
+
 def _of_place(kind: Any) -> Callable[[Surroundings], Any]:
-    return lambda s: kind(gravity=s.gravity, field=s.field, dip=s.dip)
+    return lambda s: kind(gravity=s.gravity, field=s.field, dip=s.dip, gap=_gap(s))
 
 
 def _vqf_params(s: Surroundings) -> vqf_filter.Params:
-    return vqf_filter.Params(period=s.period)
+    return vqf_filter.Params(period=s.period, gap=_gap(s))
 
 
 FILTERS: dict[str, Filter] = {
@@ -82,7 +90,7 @@ FILTERS: dict[str, Filter] = {
         Filter(
             "gyro",
             "the gyroscope alone, integrated",
-            lambda s: strapdown.Params(),
+            lambda s: strapdown.Params(gap=_gap(s)),
             strapdown.start,
             strapdown.step,
             strapdown.batch,

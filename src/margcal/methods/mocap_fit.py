@@ -111,7 +111,8 @@ def lowpass_svd(
 
     Below `cutoff_hz` the acceleration of something that stays in a room is small: (ii) without its last term. With a
     first answer the acceleration is known up to what is sought, and each frequency is then weighted with the inverse of
-    its spectrum, which halves the error. See `magnetometer` for parameters and result, here with `gravity`, m/s^2.
+    its spectrum, which halves the error. See `magnetometer` for parameters and result, here with `gravity`, m/s^2;
+    `details` also `late_s` (2,): how much later than `t` the readings came, to first order, and its standard error.
     """
     track = even_track(t, z, R, valid)
     fit = homogeneous(track, gravity, nominal, cutoff_hz)
@@ -202,6 +203,8 @@ def _finished(s: Solved, kind: Kind, method: str, raw_unit: str, unit: str, gate
     details = {"joint": C, "weights": s.weights, "track_t": s.track.t}
     if n > 15:
         details["lever_arm"] = s.x[15:]
+    if s.late is not None:
+        details["late_s"] = np.array(s.late)
     return Fit(
         model,
         s.residual,

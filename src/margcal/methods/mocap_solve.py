@@ -66,6 +66,8 @@ class Solved:
     n_iter: int
     crowded: bool = False
     """The linear acceleration is not small beside what the frequencies used show of H: the errors are widened."""
+    late: tuple[float, float] | None = None
+    """How much later the readings are than their times say, to first order, and its standard error (`_late`)."""
 
 
 def _force_rows(track: ms.Track, scaled: Scaled, win: ms.Window, b: ms.Band) -> ms.Spectra:
@@ -106,11 +108,12 @@ def homogeneous(track: ms.Track, length: float, nominal: Array | None, cutoff: f
         x = -x
     C = _sandwich(rows @ x, rows, b, weight, inverse, np.sum(win.w**2))
     crowded, shift = (False, np.zeros((15, 15))) if cutoff is None else _crowded(ms.gram(rows, b.share * weight), x)
+    late = None if cutoff is None else _late(track, scaled, win, b, rows, x, weight, inverse)
     x, C = _to_unit_length(x, C + shift)
     cost = float(np.sum(b.share * weight * np.sum(np.abs(rows @ x) ** 2, axis=1)))
     misfit = np.where(track.valid, _force_misfit(track, scaled, x), np.nan)
     condition = _condition(ms.gram(rows, b.share * weight)[:12, :12])
-    return Solved(x, C, track, scaled, length, misfit * length, win.w, cost, condition, n + again + 1, crowded)
+    return Solved(x, C, track, scaled, length, misfit * length, win.w, cost, condition, n + again + 1, crowded, late)
 
 
 def _huber_window(track: ms.Track, scaled: Scaled) -> tuple[ms.Window, int]:
@@ -183,6 +186,30 @@ def _crowded(M: Array, x: Array) -> tuple[bool, Array]:
     part = values[0] / np.maximum(values[1:] - values[0], 1e-3 * values[0])
     directions = np.concatenate([vectors[:, 1:], back @ vectors[:, 1:]]) * part * np.linalg.norm(x[:9])
     return True, directions @ directions.T
+
+
+def _late(
+    track: ms.Track,
+    scaled: Scaled,
+    win: ms.Window,
+    b: ms.Band,
+    rows: ms.Spectra,
+    x: Array,
+    weight: Array,
+    inverse: Array,
+) -> tuple[float, float]:
+    """One Gauss-Newton step for the delay d in ``R (H z(t + d) - o) = f``, along with x, and its standard error."""
+    slope = np.zeros_like(scaled.z)
+    inner = np.flatnonzero(track.valid[2:] & track.valid[1:-1] & track.valid[:-2]) + 1
+    slope[inner] = (scaled.z[inner + 1] - scaled.z[inner - 1]) / (2 * track.step)
+    turned = np.einsum("nij,nj->ni", track.R, slope @ x[:9].reshape(3, 3).T)
+    both = np.concatenate([rows, ms.plain(turned, win, b)[:, :, None]], axis=2)
+    M = ms.gram(both, b.share * weight)
+    along = np.append(-inverse @ M[:15, 15], 1.0)  # what x does while d moves
+    curvature = float(M[15] @ along)
+    S = _spectrum(rows @ x, rows, b, weight, inverse) / np.sum(win.w**2)
+    variance = along @ ms.gram(both, b.share * weight**2 * S) @ along
+    return -float(M[15, :15] @ x) / curvature, float(np.sqrt(variance)) / curvature
 
 
 def _inverse_across(curvature: Array, x: Array) -> Array:

@@ -206,7 +206,7 @@ def band(track: Track, f_max: float) -> Band:
 
 
 def _fast_length(least: int) -> int:
-    """The smallest even number from `least` on without a prime factor above 5: large ones cost fifteen times as much."""
+    """The smallest even number from `least` on without a prime factor above 5; large ones make transforms slow."""
     odd = (3**b * 5**c for b in range(16) for c in range(11))
     return min(m << max(1, (-(-least // m) - 1).bit_length()) for m in odd)
 

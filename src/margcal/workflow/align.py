@@ -244,7 +244,8 @@ def _job(
         recording = replace(recording, gyr=with_axis_reversed(gyr, axis))
         signs = np.where(np.arange(3) == "xyz".index(axis), -1.0, 1.0)
         bias = None if bias is None else (bias[0] * signs, bias[1])
-        sync = replace(sync, T=sync.T * signs)
+        both = np.concatenate([np.tile(signs, 3), np.ones(3)])
+        sync = replace(sync, T=sync.T * signs, covariance=sync.covariance * np.outer(both, both))
     say(3, 9)
     return AlignJob(recording, raw, reference, rates, sync, options, bias, axis)
 

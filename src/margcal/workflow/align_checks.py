@@ -166,6 +166,15 @@ def _axes(job: AlignJob, solved: AlignSolved, model: SensorModel) -> Check | Non
     turned = float(np.degrees(np.linalg.norm(so3.log(-between if mirrored else between))))
     name = NAMES[model.kind]
     text = f"{name}: its axes lie {turned:.1f} degrees from the gyroscope's"
+    if mirrored and turned < OFF_GYRO_DEG:
+        text = f"{name}: it shows the reverse of what gyroscope and reference say"
+        text += (
+            " of specific force: its sign is another, or the laboratory's axes are left-handed (negate one axis of "
+            "positions and attitudes; till then the frames are wrong)"
+            if model.kind == "acc"
+            else " of the field at this place; H takes care of it"
+        )
+        return Check("mirrored-axes", model.kind, turned, OFF_GYRO_DEG, "warn", text)
     if mirrored:
         text = f"{name}: its axes are mirrored against the gyroscope's, {_order(between)}; H takes care of it"
         return Check("mirrored-axes", model.kind, turned, OFF_GYRO_DEG, "warn", text)

@@ -11,7 +11,7 @@ from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit, Issue, Kind, Mask, SensorModel, Stream
 from margcal.methods import mocap_fit
-from margcal.methods.delays import SensorDelay, accelerometer_delay, delay_of, delay_of_lowest
+from margcal.methods.delays import SensorDelay, accelerometer_delay, delay_of
 from margcal.methods.mocap_frame import CommonFrame, common_frame
 from margcal.methods.r_bsn import laboratory_vector
 from margcal.methods.reference_rates import attitude_at, resample
@@ -23,8 +23,9 @@ TOLD_SE_S = 4e-3
 """A delay whose standard error is larger is not known, and not corrected."""
 EXPLAINED = 0.02
 """Share of the sensor's changes that the prediction must account for before its delay means anything."""
-THINNED_HZ = 50.0
-"""Rate that is enough to see what is left below the cut-off of `lowpass-svd`."""
+DELAY_ROUNDS, DELAY_SETTLED_S = 5, 1e-4
+CLOCKS_S = 2e-5
+"""What the clocks' relation leaves of an error in a delay, measured in simulation over ten minutes."""
 DELAY_MATTERS_S = 5e-4
 """A delay that moves by more makes the accelerometer's fit worth repeating."""
 LARGEST_DELAY_S = 0.3
@@ -106,9 +107,11 @@ def solve_right(job: AlignJob, tick: Tick) -> AlignSolved:
 
 
 def _attempt(solved: AlignSolved, kind: Kind, make: Callable[[], Fit], fits: dict[Kind, Fit]) -> None:
-    """Keep the fit of a sensor, or why there is none."""
+    """Keep the fit of a sensor and what it warns of, or why there is none."""
     try:
         fits[kind] = make()
+        if fits[kind].text:
+            solved.issues.append(Issue("weak-excitation", "warn", fits[kind].text, kind))
     except DataError as error:
         reasons = error.issues or (Issue("cannot-align", "fail", f"{NAMES[kind]}: {error}", kind),)
         solved.issues += [replace(i, level="fail", sensor=i.sensor or kind) for i in reasons]
@@ -192,24 +195,25 @@ def _accelerometer(job: AlignJob, solved: AlignSolved) -> Fit:
 
 
 def _low_passed(job: AlignJob, solved: AlignSolved) -> Fit:
-    """Without positions: the delay, too, from what is left below the cut-off."""
-    acc, start = job.recording.streams["acc"], job.sync.delay_s
+    """Without positions: the delay is one more unknown, to first order, and the fit is made again with it."""
+    acc, d = job.recording.streams["acc"], job.sync.delay_s
 
-    def fit(acc: Stream, delay: float, *, gate: bool = True) -> Fit:
+    def fit(delay: float, *, gate: bool = False) -> Fit:
         t, R, _, known = placed(job, acc, delay)
         return mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=job.options.gravity, raw_unit=acc.unit, gate=gate)
 
-    first = fit(acc, start)
-    thin = max(1, int(acc.rate / THINNED_HZ))
-    few = replace(acc, t=acc.t[::thin], y=acc.y[::thin])
-    # one equation a period of the cut-off: motion is no white noise, and so the errors come out right in simulation
-    freedom = mocap_fit.CUTOFF_HZ * np.count_nonzero(job.rates.valid) / job.rates.rate
-    delay = delay_of_lowest(lambda d: float(fit(few, d, gate=False).cost), start=start, freedom=freedom)
-    if not (np.isfinite(delay.se_s) and delay.se_s < TOLD_SE_S):
-        solved.issues.append(_unknown_delay("acc", delay))
-        return first
-    solved.delays["acc"] = (delay.delay_s, delay.se_s)
-    return fit(acc, delay.delay_s)
+    step, se = 0.0, np.inf
+    for _ in range(DELAY_ROUNDS):
+        step, se = (float(v) for v in fit(d).details["late_s"])
+        d += step
+        if abs(step) < DELAY_SETTLED_S:
+            break
+    settled = abs(step) < TOLD_SE_S and abs(d - job.sync.delay_s) < LARGEST_DELAY_S
+    if not (settled and se < TOLD_SE_S):
+        solved.issues.append(_unknown_delay("acc", SensorDelay(d, se, 0.0) if settled else None))
+        return fit(job.sync.delay_s, gate=True)
+    solved.delays["acc"] = (d, float(np.hypot(se, CLOCKS_S)))
+    return fit(d, gate=True)
 
 
 def _same_handed(job: AlignJob, fits: dict[Kind, Fit]) -> None:

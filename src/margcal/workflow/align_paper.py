@@ -42,6 +42,8 @@ def solve_paper(job: AlignJob, tick: Tick) -> AlignSolved:
     turning = rate_excitation(rates.w[rates.valid])
     if turning.level == "fail":
         raise DataError(turning.text, (Issue("poor-excitation", "fail", turning.text, "gyr"),))
+    if turning.text:
+        solved.issues.append(Issue("weak-excitation", "warn", turning.text, "gyr"))
     readings = {
         kind: y
         for kind in ("acc", "mag")
@@ -77,13 +79,15 @@ def _excited(job: AlignJob, solved: AlignSolved, kind: Kind, y: Array) -> Array 
     try:
         v = laboratory_vector(y[use], R, so3.nearest_rotation(job.sync.T))
         spread = attitude_excitation(kind, np.einsum("nji,j->ni", R, v))
-        text = spread.text if spread.level == "fail" else None
     except DataError as error:
-        text = str(error)
-    if text is None:
-        return y
-    solved.issues.append(Issue("poor-excitation", "fail", text, kind))
-    return None
+        solved.issues.append(Issue("poor-excitation", "fail", str(error), kind))
+        return None
+    if spread.level == "fail":
+        solved.issues.append(Issue("poor-excitation", "fail", spread.text, kind))
+        return None
+    if spread.text:
+        solved.issues.append(Issue("weak-excitation", "warn", spread.text, kind))
+    return y
 
 
 def _as_printed(job: AlignJob, Omega: Array, w_ref: Array, T: Array) -> Issue:
@@ -160,7 +164,9 @@ def _gyroscope_covariance(job: AlignJob, fit: Fit, found: RBsn) -> Fit:
     if job.static_bias is not None:
         C[9:, 9:] = np.diag(job.static_bias[1] ** 2)
     else:
-        Tinv = np.linalg.inv(job.sync.T)
-        C[9:, 9:] = Tinv @ job.sync.covariance[9:, 9:] @ Tinv.T
+        # B = -T^-1 c, hence dB = -T^-1 (dc + dT B)
+        T, c = job.sync.T, job.sync.c
+        by = -np.linalg.solve(T, np.column_stack([np.kron(np.eye(3), -np.linalg.solve(T, c)), np.eye(3)]))
+        C[9:, 9:] = by @ job.sync.covariance @ by.T
     model = replace(fit.model, covariance=(C + C.T) / 2)
     return replace(fit, model=model, covariance=model.covariance)

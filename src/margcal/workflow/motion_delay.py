@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from margcal.core.errors import DataError
+from margcal.core.types import Issue
 from margcal.methods.rates import relate
 from margcal.workflow.job import Job, Solved
 
@@ -37,3 +38,9 @@ def keep_magnetometer_delay(job: Job, solved: Solved) -> None:
             best = (found.delay_s, found.delay_se_s)
     if best is not None and abs(best[0]) > max(CLEAR * best[1], SMALLEST_S):
         solved.delays["mag"] = best
+        late, se = 1e3 * best[0], 1e3 * best[1]
+        text = (
+            f"magnetometer: {abs(late):.1f} +- {se:.1f} ms {'behind' if late > 0 else 'ahead of'} the gyroscope, told by "
+            "the turns; margcal apply and margcal orient correct it, H and B do not depend on it"
+        )
+        solved.issues.append(Issue("mag-delay", "note", text, "mag", best[0]))

@@ -22,6 +22,8 @@ TOGETHER = 6
 """Windows in a row over which a turn is told from a bias."""
 INDEPENDENT = 8
 """Samples of a sensor that count as one reading: it may be slower than the gyroscope, or filtered."""
+AGREE = 0.01
+"""Largest difference (rad/s) of a rest's mean rate from that of the others: a bias is the same in all of them."""
 LEAST_S = 1.0
 """Seconds of rest from which a bias is taken."""
 AT_START_S = 3.0
@@ -75,6 +77,8 @@ def find_rests(t: Array, gyr: Array, acc: Array, mag: Array, *, calibrated: bool
         middle = (first + last) / 2
         vectors = (a, mag[rows].reshape(count, width, 3))
         still &= ~_turning(still, mean, middle, (middle - half, middle + half), vectors)
+    if still.any():
+        still &= np.abs(mean - _middle(mean[still])).max(axis=1) < AGREE
     seconds = float(np.sum((last - first)[still])) + np.count_nonzero(still) * period
     bias = _middle(mean[still]) if seconds >= LEAST_S else None
     return Rests(first, last, still, bias, seconds)

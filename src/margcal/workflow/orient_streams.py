@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from margcal.core.errors import DataError, InputError, UsageError
 from margcal.core.types import Array, Calibration, Issue, Kind, Recording, Stream
 from margcal.core.units import SI_COLUMN, UNITS
 from margcal.workflow.lint_scale import clip_limits
+from margcal.workflow.lint_units import TURN_RATIO, lint_units, turn_ratio
 
 NAMES = {"acc": "accelerometer", "gyr": "gyroscope", "mag": "magnetometer"}
 
@@ -22,6 +23,13 @@ DELAY_SE_S = 2e-3
 
 DELAY_EXPLAINED = 0.5
 """Share of the field's turning that the gyroscope must explain before a delay between the two means anything."""
+
+
+LARGEST = 1e15
+"""Readings beyond this come from no converter, and their squares from no arithmetic."""
+
+SLOWER = 1.5
+"""A sensor that is measured in fewer of a table's rows than one in so many has a rate of its own."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,8 @@ def si_streams(
     delays: dict[Kind, float] = {}
     for kind, raw in recording.streams.items():
         y = _without_clipped(raw, recording.source, issues)
+        with np.errstate(invalid="ignore"):
+            y = np.where(np.abs(y) <= LARGEST, y, np.nan)
         model = models.get(kind)
         if model is not None:
             if raw.unit != model.raw_unit:
@@ -63,8 +73,58 @@ def si_streams(
         if calibration is not None:
             text = f"{recording.source}: the {NAMES[kind]} is not in the calibration; taken as it is"
             issues.append(Issue("not-calibrated", "warn", text, kind))
-        streams[kind] = Stream(kind, raw.t, y * factor, "norm" if raw.unit == "norm" else "")
+        unit = {"acc": "mps2", "gyr": "radps", "mag": "norm" if raw.unit == "norm" else "uT"}[kind]
+        streams[kind] = Stream(kind, raw.t, y * factor, unit)
     return streams, delays
+
+
+def check_plausible(
+    streams: Mapping[Kind, Stream], recording: Recording, calibration: Calibration | None, issues: list[Issue]
+) -> None:
+    """Refuse readings that cannot be what their unit, or the calibration, says; name an axis that stands still.
+
+    Raises
+    ------
+    InputError
+        Gravity or field of an impossible length, or gravity that turns at another rate than the gyroscope's.
+    DataError
+        An accelerometer from which gravity was taken, or a gyroscope that does not turn when the node does.
+    """
+    where, calibrated = recording.source, set() if calibration is None else set(calibration.models)
+    # of a sensor that was not calibrated the readings as they were recorded, so that the text names their unit
+    seen = {k: s if k in calibrated else recording.streams[k] for k, s in streams.items()}
+    seen = {k: replace(v, y=np.where(np.isfinite(streams[k].y), v.y, np.nan)) for k, v in seen.items()}
+    for issue in lint_units(Recording(**seen, source=where)):  # type: ignore[arg-type]
+        if issue.code.endswith("-unit"):
+            kind = next(k for k in NAMES if issue.code.startswith(k))
+            of = f"{issue.text.partition(';')[0]} after the calibration: it is of another node or of another range"
+            raise InputError(of if kind in calibrated else issue.text)
+        if issue.code == "no-gravity" and issue.value:
+            raise DataError(issue.text, (issue,))
+    ratio = turn_ratio(streams["acc"], streams["gyr"]) if _enough(streams) else None
+    if ratio is not None and not 1 / TURN_RATIO < ratio < TURN_RATIO:
+        text = (
+            f"{where}: gravity turns {ratio:.3g} times as fast as the gyroscope says: the gyroscope is dead, of "
+            "another clock, or in another unit"
+        )
+        raise DataError(text, (Issue("gyr-turns", "fail", text, "gyr", ratio, TURN_RATIO),))
+    issues += [i for k, s in streams.items() for i in _standing(k, s, where)]
+
+
+def _enough(streams: Mapping[Kind, Stream]) -> bool:
+    """Whether accelerometer and gyroscope are there to be compared, without holes."""
+    pair = [streams.get(k) for k in ("acc", "gyr")]
+    return all(s is not None and len(s.t) >= 16 and bool(np.isfinite(s.y.sum())) for s in pair)
+
+
+def _standing(kind: Kind, stream: Stream, source: str) -> list[Issue]:
+    y = stream.y[np.isfinite(stream.y).all(axis=1)]
+    still = np.ptp(y, axis=0) == 0 if len(y) >= 16 else np.zeros(3, dtype=bool)
+    if not still.any() or still.all():
+        return []
+    names = " and ".join(a for a, s in zip("xyz", still) if s)
+    text = f"{source}: the {NAMES[kind]}'s {names} stands at one value throughout while other axes move: is it alive?"
+    return [Issue("stuck-axis", "warn", text, kind)]
 
 
 def _without_clipped(stream: Stream, source: str, issues: list[Issue]) -> Array:
@@ -159,9 +219,9 @@ def one_clock(streams: Mapping[Kind, Stream], late: Mapping[Kind, float], source
 
 def _at(t: Array, stream: Stream, delay: float) -> Array:
     """Readings (N, 3) at times `t`: interpolated, NaN beyond the ends and in gaps."""
-    if delay == 0.0 and (stream.t is t or np.array_equal(stream.t, t)):
-        return stream.y
     good = np.isfinite(stream.y).all(axis=1)
+    if delay == 0.0 and (stream.t is t or np.array_equal(stream.t, t)) and SLOWER * good.sum() > len(t):
+        return stream.y
     clock, y = stream.t[good], stream.y[good]
     out = np.full((len(t), 3), np.nan)
     if len(clock) < 2:
