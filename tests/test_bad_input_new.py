@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from margcal.core import so3
 from margcal.core.types import Array, Calibration
 from margcal.files.calfile import save
 from margcal.files.tables import write_table
@@ -292,3 +293,21 @@ def test_advice_for_a_reference_names_no_option_that_does_not_reach_it(tmp_path:
     outcome = margcal(tmp_path, "align", "node.csv", "--reference", "ref.csv")
     refused(outcome, 1, "ref.csv")
     assert "--skip-bad" not in outcome.err
+
+
+def test_markers_without_a_unit_are_refused_and_read_once_it_is_told(tmp_path: Path) -> None:
+    sim = simulate_mocap(seed=5, duration_s=30.0, offset_s=0.1)
+    write_table(tmp_path / "node.parquet", columns(sim.recording))
+    q, p = sim.reference.q, sim.reference.p
+    assert p is not None
+    shape = np.array([[0.0, 0.0, 0.0], [0.08, 0.0, 0.0], [0.05, 0.06, 0.0]])
+    x = 1e3 * (np.einsum("nij,mj->nmi", so3.matrix_from_quat(q), shape) + p[:, None])
+    table = {"t_s": sim.reference.t}
+    table |= {f"{n}_{a}": x[:, m, i] for m, n in enumerate("ABC") for i, a in enumerate("xyz")}
+    write_table(tmp_path / "markers.csv", table)
+    call = ("align", "node.parquet", "--reference", "markers.csv", "--markers", "A,B,C", "-o", "cal.json")
+    refused(margcal(tmp_path, *call), 1, "--marker-unit")
+    told = margcal(tmp_path, *call, "--marker-unit", "mm", "--json")
+    assert told.status == 0, told.err
+    lever = json.loads((tmp_path / "cal.json").read_text())["alignment"]["lever_arm_m"]
+    np.testing.assert_allclose(lever, (0.03, -0.02, 0.01), atol=2e-3)

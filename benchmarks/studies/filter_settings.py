@@ -5,7 +5,8 @@
 The phone's magnetometer is calibrated with the figures of the data's README, its accelerometer with what `margcal
 calibrate` makes of the session beside it; the gyroscope's bias is its mean against the optics, whose frame is turned to
 magnetic north. Error: inclination RMS and standard deviation of the heading together, mean over the motions, degrees.
-BROAD is not read here; `orientation.py` says what part it had. Needs the recordings (MARGCAL_DATA) and the compiled filters (else it takes long).
+BROAD is not read here; `orientation.py` says what part it had. Needs the recordings (MARGCAL_DATA) and the compiled
+filters (else it takes long).
 """
 
 from __future__ import annotations

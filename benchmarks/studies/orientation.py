@@ -3,10 +3,11 @@
     python benchmarks/studies/orientation.py [FILTER ...]
 
 BROAD's own figures (`evaluate`: total, heading and inclination over the samples in which the body moved, nothing
-aligned). The settings' numbers were taken on tyrex's motions or by reasoning, as the filters' docstrings say, and are not
-those that do best here; but these trials were looked at on the way (thinned to 71 Hz), and it was they that showed that
-the accelerometer's gate had better be open (means of 5.2-6.4 degrees with gates up to .1, 2.6-2.9 open; tyrex agrees).
-Needs the recordings (MARGCAL_DATA). Prints the table and writes results/orientation.json; a minute with the compiled filters.
+aligned). The settings' numbers were taken on tyrex's motions or by reasoning, as the filters' docstrings say, and are
+not those that do best here; but these trials were looked at on the way (thinned to 71 Hz), and it was they that showed
+that the accelerometer's gate had better be open (means of 5.2-6.4 degrees with gates up to .1, 2.6-2.9 open; tyrex
+agrees). Needs the recordings (MARGCAL_DATA). Prints the table and writes results/orientation.json; a minute with the
+compiled filters.
 """
 
 from __future__ import annotations

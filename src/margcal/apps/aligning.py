@@ -30,6 +30,7 @@ def run(
     static: str | None,
     common_clock: bool,
     markers: str | None,
+    marker_unit: str | None,
     sensors: str | None,
     at: str | None,
     output: str | None,
@@ -58,7 +59,7 @@ def run(
     own = os.path.realpath(recording) == os.path.realpath(reference)
     if own and node.reference is None:
         raise InputError(f"{node.source}: holds no reference (ref_qw ref_qx ref_qy ref_qz); name the file that does")
-    asked["reference"] = node.reference if own else _reference(reference, markers)
+    asked["reference"] = node.reference if own else _reference(reference, markers, marker_unit)
     asked["common_clock"] = own or common_clock
     if static is not None:
         asked["static"] = read_one(static, reading)
@@ -80,12 +81,12 @@ def run(
     return 0
 
 
-def _reference(path: str, markers: str | None) -> Reference:
+def _reference(path: str, markers: str | None, unit: str | None) -> Reference:
     from margcal.files.references import read_reference
 
     names = [n.strip() for n in markers.split(",") if n.strip()] if markers else None
     with screen.progress(f"reading {Path(path).name}"):
-        return read_reference(path, markers=names)
+        return read_reference(path, markers=names, unit=unit)
 
 
 def _aligned(node: Recording, asked: Mapping[str, Any]) -> tuple[Calibration, str | None]:

@@ -226,6 +226,11 @@ def calibrate(recordings: tuple[str, ...], level_sd: float, **given: Any) -> int
 @click.option("--common-clock", is_flag=True, help="REF is on the node's clock (always so if it is RECORDING).")
 @click.option("--markers", metavar="NAME,...", help="Markers of the body, where REF holds marker tracks (C3D, table).")
 @click.option(
+    "--marker-unit",
+    type=click.Choice(["m", "cm", "mm", "in"]),
+    help="Unit of length of a C3D file or marker table that names none.",
+)
+@click.option(
     "--method",
     type=click.Choice(["r-bsn", "lowpass-svd", "forward"]),
     help="The paper's; without positions; with positions.  [default: by what REF holds]",
@@ -401,7 +406,9 @@ def compare(calibrations: tuple[str, ...], **given: Any) -> int:
 @click.option("--n-poses", type=int, metavar="N", help="Rests.  [default: 24]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--node-seed", type=click.IntRange(min=0), help="Seed of the node alone: several recordings of one node.")
-@click.option("--poses", type=click.Choice(["cube", "free", "faces", "swing", "mocap"]), default="cube", show_default=True)
+@click.option(
+    "--poses", type=click.Choice(["cube", "free", "faces", "swing", "mocap"]), default="cube", show_default=True
+)
 @_sensors
 @_at
 @click.option("--rate", type=float, metavar="HZ", help="Samples per second.  [default: 100]")

@@ -107,7 +107,10 @@ def _show(found: Orientation, output: str) -> None:
     if figures["end_sd_deg"] is not None:
         east, north, up = figures["end_sd_deg"]
         tilt = (0.5 * (east**2 + north**2)) ** 0.5
-        screen.line(f"believed error at the end: tilt {tilt:.2g}, heading {up:.2g} deg (1 sd)")
+        screen.line(
+            f"spread at the end by the filter's noise model: tilt {tilt:.2g}, heading {up:.2g} deg (1 sd; motion and "
+            "bent fields come on top)"
+        )
     for issue in found.issues:
         screen.line(f"{issue.level}: {issue.text}", style="yellow" if issue.level == "warn" else "")
     screen.line(f"written: {output}")

@@ -236,7 +236,7 @@ def _check_rigid(markers: Markers) -> None:
     if apart > LARGEST_ROOM_M:
         raise InputError(
             f"{markers.source}: {printable(a, 40)} and {printable(b, 40)} are {apart:.0f} m apart: millimetres taken "
-            "for metres? Name the columns by their unit (_mm, _m), or declare it"
+            "for metres? Name the columns by their unit (_mm, _m), or declare it (--marker-unit)"
         )
     groups = [g for g in _groups(sd) if len(g) >= 3]
     hint = "; ".join(", ".join(markers.names[k] for k in g) for g in groups[:6])
@@ -269,12 +269,12 @@ def _unit_of(name: str, axes: Mapping[str, tuple[int, str]], declared: str | Non
 def _factor(stated: str, declared: str | None, where: str) -> float:
     if stated and stated not in METRES:
         if declared is None:
-            raise InputError(f"{where}: its length unit is {stated!r}; declare m, cm, mm or in")
+            raise InputError(f"{where}: its length unit is {stated!r}; declare m, cm, mm or in (--marker-unit)")
         stated = ""
     if stated and declared is not None and METRES[stated] != METRES[declared]:
         raise InputError(f"{where}: is in {stated}, and {declared} was declared; leave the declaration out")
     if not stated and declared is None:
-        raise InputError(f"{where}: no length unit; end the column names in _mm or _m, or declare the unit")
+        raise InputError(f"{where}: no length unit; end the column names in _mm or _m, or declare it (--marker-unit)")
     return METRES[stated or declared or ""]
 
 

@@ -55,9 +55,13 @@ class Filter(NamedTuple):
 MISSED = 2.5
 """Usual steps without a sample that are a gap where the sensor is slow; at 10 Hz and above a quarter of a second is."""
 
+LONGEST = 0.9
+"""Seconds beyond which a rate says so little of the turn since the last one that a filter which corrects does better
+without it."""
+
 
 def _gap(s: Surroundings) -> float:
-    return max(strapdown.Params().gap, MISSED * s.period)
+    return min(max(strapdown.Params().gap, MISSED * s.period), LONGEST)
 
 
 def _of_place(kind: Any) -> Callable[[Surroundings], Any]:
@@ -90,7 +94,7 @@ FILTERS: dict[str, Filter] = {
         Filter(
             "gyro",
             "the gyroscope alone, integrated",
-            lambda s: strapdown.Params(gap=_gap(s)),
+            lambda s: strapdown.Params(gap=max(strapdown.Params().gap, MISSED * s.period)),
             strapdown.start,
             strapdown.step,
             strapdown.batch,

@@ -112,7 +112,7 @@ def lowpass_svd(
     Below `cutoff_hz` the acceleration of something that stays in a room is small: (ii) without its last term. With a
     first answer the acceleration is known up to what is sought, and each frequency is then weighted with the inverse of
     its spectrum, which halves the error. See `magnetometer` for parameters and result, here with `gravity`, m/s^2;
-    `details` also `late_s` (2,): how much later than `t` the readings came, to first order, and its standard error.
+    `details` also `late_s` (2,): how much later than `t` the readings came, to first order, and its standard error, s.
     """
     track = even_track(t, z, R, valid)
     fit = homogeneous(track, gravity, nominal, cutoff_hz)
@@ -143,7 +143,8 @@ def forward(
     Returns
     -------
     Fit
-        As of `magnetometer`; `details` also `lever_arm` (3,) m in k, and `joint` is (18, 18): (H, B, u, r).
+        As of `magnetometer`; `details` also `late_s` (as of `lowpass_svd`), `lever_arm` (3,) m in k, and `joint` is
+        (18, 18): (H, B, u, r).
     """
     track = even_track(t, z, R, valid, p)
     fit = with_positions(track, gravity, lever)

@@ -108,7 +108,7 @@ def homogeneous(track: ms.Track, length: float, nominal: Array | None, cutoff: f
         x = -x
     C = _sandwich(rows @ x, rows, b, weight, inverse, np.sum(win.w**2))
     crowded, shift = (False, np.zeros((15, 15))) if cutoff is None else _crowded(ms.gram(rows, b.share * weight), x)
-    late = None if cutoff is None else _late(track, scaled, win, b, rows, x, weight, inverse)
+    late = None if cutoff is None else _late(track, scaled, win, b, rows, rows @ x, x, weight, inverse)
     x, C = _to_unit_length(x, C + shift)
     cost = float(np.sum(b.share * weight * np.sum(np.abs(rows @ x) ** 2, axis=1)))
     misfit = np.where(track.valid, _force_misfit(track, scaled, x), np.nan)
@@ -194,22 +194,25 @@ def _late(
     win: ms.Window,
     b: ms.Band,
     rows: ms.Spectra,
+    residual: ms.Spectra,
     x: Array,
     weight: Array,
     inverse: Array,
 ) -> tuple[float, float]:
-    """One Gauss-Newton step for the delay d in ``R (H z(t + d) - o) = f``, along with x, and its standard error."""
+    """One Gauss-Newton step for the delay d in ``R (H z(t + d) - o)``, along with x, and its standard error."""
     slope = np.zeros_like(scaled.z)
     inner = np.flatnonzero(track.valid[2:] & track.valid[1:-1] & track.valid[:-2]) + 1
     slope[inner] = (scaled.z[inner + 1] - scaled.z[inner - 1]) / (2 * track.step)
     turned = np.einsum("nij,nj->ni", track.R, slope @ x[:9].reshape(3, 3).T)
-    both = np.concatenate([rows, ms.plain(turned, win, b)[:, :, None]], axis=2)
+    column = ms.plain(turned, win, b)
+    both = np.concatenate([rows, column[:, :, None]], axis=2)
     M = ms.gram(both, b.share * weight)
-    along = np.append(-inverse @ M[:15, 15], 1.0)  # what x does while d moves
-    curvature = float(M[15] @ along)
-    S = _spectrum(rows @ x, rows, b, weight, inverse) / np.sum(win.w**2)
+    along = np.append(-inverse @ M[:-1, -1], 1.0)  # what x does while d moves
+    curvature = float(M[-1] @ along)
+    gradient = float(np.sum((b.share * weight)[:, None] * (np.conj(column) * residual).real))
+    S = _spectrum(residual, rows, b, weight, inverse) / np.sum(win.w**2)
     variance = along @ ms.gram(both, b.share * weight**2 * S) @ along
-    return -float(M[15, :15] @ x) / curvature, float(np.sqrt(variance)) / curvature
+    return -gradient / curvature, float(np.sqrt(variance)) / curvature
 
 
 def _inverse_across(curvature: Array, x: Array) -> Array:
@@ -270,7 +273,8 @@ def with_positions(track: ms.Track, gravity: float, lever: bool) -> Solved:
     misfit = np.where(track.valid, np.linalg.norm(misfit, axis=1), np.nan)
     cost = float(np.sum(b.share * weight * np.sum(np.abs(residual) ** 2, axis=1)))
     condition = _condition(ms.gram(rows, b.share * weight))
-    return Solved(x, C, track, scaled, gravity, misfit * gravity, win.w, cost, condition, n + 1)
+    late = _late(track, scaled, win, b, rows, residual, x, weight, inverse)
+    return Solved(x, C, track, scaled, gravity, misfit * gravity, win.w, cost, condition, n + 1, late=late)
 
 
 def _upright(x: Array, rows: ms.Spectra, target: ms.Spectra, weight: Array) -> Array:

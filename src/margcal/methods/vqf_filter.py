@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from margcal.core import so3
 from margcal.core.errors import InputError
-from margcal.core.types import Array
+from margcal.core.types import Array, Mask
 from margcal.methods.tracking import (
     ACC,
     GAP,
@@ -181,11 +181,34 @@ def _online(params: Params, state: State, samples: _Samples) -> Track:
             _begin(vqf, q[part.start - 1] if part.start else state.q)
             vqf.setBiasEstimate(bias, sigma)
         t, (gyr, acc, mag), even = _even(params, samples, part)
+        rejected_s = float(vqf.state["magRejectT"])
         out = vqf.updateBatch(gyr, acc, mag if nine else None)
         q[part] = _back(t, even, out["quat9D" if nine else "quat6D"])
         if nine and t is even:
-            flags[part] &= ~np.where(out["magDistDetected"], MAG, 0).astype(np.uint8)
+            taken = part.start + np.flatnonzero(flags[part] & MAG)  # VQF passes over the others
+            left_out = _rejected(np.asarray(out["magDistDetected"], dtype=bool)[taken - part.start], rejected_s, vqf)
+            flags[taken[left_out]] &= ~np.uint8(MAG)
     return Track(q, np.full((len(q), 3), np.nan), flags, State(dict(vqf.state), q[-1].copy(), flags[-1]))
+
+
+def _rejected(disturbed: Mask, seconds: float, vqf: Any) -> Mask:
+    """Samples (N,) of which VQF does not take the magnetometer. A field that it finds disturbed is left out for
+    `magMaxRejectionTime` and then taken with less weight, so also at the start, where it knows no field yet."""
+    most, factor, period = (float(v) for v in _limits(vqf))
+    out = np.zeros(len(disturbed), dtype=bool)
+    edges = [0, *(np.flatnonzero(np.diff(disturbed)) + 1).tolist(), len(disturbed)]
+    for a, b in itertools.pairwise(edges if len(out) else []):
+        if not disturbed[a]:
+            seconds = max(seconds - factor * period * (b - a), 0.0)
+            continue
+        count = min(b - a, int(np.floor(max(most - seconds, -period) / period + 1e-9)) + 1)
+        out[a : a + count] = True
+        seconds += period * count
+    return out
+
+
+def _limits(vqf: Any) -> tuple[float, float, float]:
+    return vqf.params["magMaxRejectionTime"], vqf.params["magRejectionFactor"], vqf.coeffs["magTs"]
 
 
 def _begin(vqf: Any, q: Array) -> None:

@@ -234,7 +234,9 @@ def _job(
     diagnosis = align_diagnose.synchronised(gyr, reference, rates, common)
     sync = diagnosis.sync
     if static is not None and bias is not None:
-        issues += _foreign_static(static, bias[0], sync)
+        foreign = _foreign_static(static, bias[0], sync, options.method == "r-bsn")
+        issues += foreign
+        bias = None if foreign and options.method != "r-bsn" else bias
     issues += diagnosis.issues
     raw, axis = recording, None
     if diagnosis.mirrored:
@@ -267,8 +269,8 @@ def _static_bias(static: Recording, moved: Stream) -> tuple[Array, Array]:
     return y.mean(axis=0), np.std(parts, axis=0) / 2 + np.std(y, axis=0) / np.sqrt(len(y)) + 1e-12
 
 
-def _foreign_static(static: Recording, bias: Array, sync: Synchronisation) -> list[Issue]:
-    """Is the bias at rest that of the moved trial? Then ``T b + c`` of (16) is nothing.
+def _foreign_static(static: Recording, bias: Array, sync: Synchronisation, used: bool) -> list[Issue]:
+    """Is the bias at rest that of the moved trial? Then ``T b + c`` of (16) is nothing. `used`: it is taken either way.
 
     Raises
     ------
@@ -283,8 +285,10 @@ def _foreign_static(static: Recording, bias: Array, sync: Synchronisation) -> li
     level: Literal["warn", "fail"] = "fail" if sure > FOREIGN_DEG_S else "warn"
     text = (
         f"{static.source}: at rest the gyroscope's bias is {np.degrees(miss.max()):.2f} deg/s off what the moved trial "
-        "shows: give a trial at rest of the same node and day, or leave --static out"
+        "shows"
     )
+    text += "" if used else ", which is taken instead"
+    text += ": give a trial at rest of the same node and day, or leave --static out"
     issue = Issue("static-bias", level, text, "gyr", float(np.degrees(miss.max())), DRIFTED_DEG_S)
     if level == "fail":
         raise DataError(text, (issue,))

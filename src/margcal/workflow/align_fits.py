@@ -11,7 +11,7 @@ from margcal.core import so3
 from margcal.core.errors import DataError
 from margcal.core.types import Array, Fit, Issue, Kind, Mask, SensorModel, Stream
 from margcal.methods import mocap_fit
-from margcal.methods.delays import SensorDelay, accelerometer_delay, delay_of
+from margcal.methods.delays import FARTHEST_S, SensorDelay, delay_of
 from margcal.methods.mocap_frame import CommonFrame, common_frame
 from margcal.methods.r_bsn import laboratory_vector
 from margcal.methods.reference_rates import attitude_at, resample
@@ -26,8 +26,6 @@ EXPLAINED = 0.02
 DELAY_ROUNDS, DELAY_SETTLED_S = 5, 1e-4
 CLOCKS_S = 2e-5
 """What the clocks' relation leaves of an error in a delay, measured in simulation over ten minutes."""
-DELAY_MATTERS_S = 5e-4
-"""A delay that moves by more makes the accelerometer's fit worth repeating."""
 LARGEST_DELAY_S = 0.3
 APART, WIDE = 2.0, 0.005
 """Standard errors between the two estimates of T from which errors are widened; difference that is warned of."""
@@ -174,38 +172,23 @@ def _magnetometer(job: AlignJob, solved: AlignSolved) -> Fit:
 
 
 def _accelerometer(job: AlignJob, solved: AlignSolved) -> Fit:
+    """The delay is one more unknown, to first order, and the fit is made again with it."""
     acc, d, options = job.recording.streams["acc"], job.sync.delay_s, job.options
-    t, R, p, known = placed(job, acc, d)
-    if options.method == "lowpass-svd" or p is None:
-        return _low_passed(job, solved)
-    rough = mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=options.gravity, raw_unit=acc.unit, gate=False)
-    check_laboratory(acc, job.rates, job.sync, rough.model.H, rough.model.B)
-    known = known & np.isfinite(p).all(axis=1)
-    fit = mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit)
-    delay = accelerometer_delay(job.sync.reference_time(acc.t), acc.y, job.rates, start=d)
-    if not usable(delay):
-        solved.issues.append(_unknown_delay("acc", delay))
-        return fit
-    solved.delays["acc"] = (delay.delay_s, delay.se_s)
-    t, R, p, known = placed(job, acc, delay.delay_s)
-    if p is None or abs(delay.delay_s - d) <= DELAY_MATTERS_S:
-        return fit
-    known = known & np.isfinite(p).all(axis=1)
-    return mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit)
 
+    def fit(delay: float, *, gate: bool = False, positions: bool = options.method == "forward") -> Fit:
+        t, R, p, known = placed(job, acc, delay)
+        if p is None or not positions:
+            return mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=options.gravity, raw_unit=acc.unit, gate=gate)
+        known = known & np.isfinite(p).all(axis=1)
+        return mocap_fit.forward(t, acc.y, R, p, known, gravity=options.gravity, raw_unit=acc.unit, gate=gate)
 
-def _low_passed(job: AlignJob, solved: AlignSolved) -> Fit:
-    """Without positions: the delay is one more unknown, to first order, and the fit is made again with it."""
-    acc, d = job.recording.streams["acc"], job.sync.delay_s
-
-    def fit(delay: float, *, gate: bool = False) -> Fit:
-        t, R, _, known = placed(job, acc, delay)
-        return mocap_fit.lowpass_svd(t, acc.y, R, known, gravity=job.options.gravity, raw_unit=acc.unit, gate=gate)
-
+    rough = fit(d, positions=False)
+    if options.method == "forward":
+        check_laboratory(acc, job.rates, job.sync, rough.model.H, rough.model.B)
     step, se = 0.0, np.inf
     for _ in range(DELAY_ROUNDS):
         step, se = (float(v) for v in fit(d).details["late_s"])
-        d += step
+        d += float(np.clip(step, -FARTHEST_S, FARTHEST_S))
         if abs(step) < DELAY_SETTLED_S:
             break
     settled = abs(step) < TOLD_SE_S and abs(d - job.sync.delay_s) < LARGEST_DELAY_S

@@ -19,8 +19,11 @@ CLIP_RUN = 3
 ABRUPT_LSB = 3.0
 """Steps into and out of a clipped stretch, LSB: the top of a smooth curve that stays level for three samples is
 entered and left by less."""
-ABRUPT_NOISE = 6.0
-"""The same in noise (sd): steps that large in and out of a level stretch are motion that was cut off."""
+ABRUPT_NOISE = 12.0
+"""The same in noise (sd): steps that large in and out of a level stretch are motion that was cut off. The top of a fast
+turn is entered by up to 6, which with luck in the noise looks level (once in 1800 extremes at 6, never seen at 12)."""
+LARGE_STEP = 6.0
+"""Steps (sd of the noise) that are motion."""
 HEAP, HEAP_LEAST = 5.0, 10
 """Readings at the extreme over those at a value next to it, and how many make a heap."""
 CHANCE, CHANCE_CUT_OFF = 1e-6, 1e-3
@@ -136,7 +139,7 @@ def _clips_at(view: View, axis: int, extreme: float) -> bool:
 def _equal_in_motion(x: Array, at: Mask, noise: float) -> float:
     """Share of equal neighbours beside steps of motion: high only where samples were held or filled in."""
     step = np.diff(x)
-    large = np.abs(step) >= ABRUPT_NOISE * noise
+    large = np.abs(step) >= LARGE_STEP * noise
     beside = (large[:-2] | large[2:]) & ~at[1:-2]
     return float(np.count_nonzero(beside & (step[1:-1] == 0))) / max(float(np.count_nonzero(beside)), 1.0)
 

@@ -39,8 +39,9 @@ def keep_magnetometer_delay(job: Job, solved: Solved) -> None:
     if best is not None and abs(best[0]) > max(CLEAR * best[1], SMALLEST_S):
         solved.delays["mag"] = best
         late, se = 1e3 * best[0], 1e3 * best[1]
+        where = "behind" if late > 0 else "ahead of"
         text = (
-            f"magnetometer: {abs(late):.1f} +- {se:.1f} ms {'behind' if late > 0 else 'ahead of'} the gyroscope, told by "
-            "the turns; margcal apply and margcal orient correct it, H and B do not depend on it"
+            f"magnetometer: {abs(late):.1f} +- {se:.1f} ms {where} the gyroscope, told by the "
+            "motion; margcal apply and margcal orient correct it, H and B do not depend on it"
         )
         solved.issues.append(Issue("mag-delay", "note", text, "mag", best[0]))

@@ -11,19 +11,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from margcal.core import so3
 from margcal.core.errors import InputError, UsageError
 from margcal.core.types import Array, Attitude, Calibration, Issue, Kind, Mask, Recording, Stream
 from margcal.methods.filters import DEFAULT, Filter, Surroundings, find_filter
-from margcal.methods.tracking import ACC, GAP, MAG, NO_GYR, Flags, Track, to_plain
-from margcal.workflow.orient_start import Rests, find_rests, first_attitude, surroundings_of
-from margcal.workflow.orient_streams import NAMES, Samples, delays_to_correct, one_clock, si_streams
+from margcal.methods.tracking import ACC, GAP, MAG, NO_GYR, Flags, Track, measured_rate, to_earth, to_plain
+from margcal.workflow.orient_start import Rests, find_rests, first_attitude, levelled, surroundings_of
+from margcal.workflow.orient_streams import (
+    NAMES,
+    Samples,
+    check_plausible,
+    delays_to_correct,
+    one_clock,
+    si_streams,
+)
 
 Frame = Literal["enu", "ned", "nwu"]
 Delays = Literal["file", "estimate", "none"]
@@ -40,6 +47,20 @@ FRAMES: dict[str, tuple[float, float, float, float]] = {
 CHUNK = 20_000
 """Samples between two ticks of the progress bar."""
 
+LOST_S = 0.5
+"""Seconds without samples or rates after which a node may lie anyhow: its attitude is then read off again, not
+corrected. A tilt that is off by a right angle is beyond what the corrections of a Kalman filter are made for."""
+
+MOST_LOST = 0.05
+"""Share of the samples before which time is missing from which a recording is slow, not broken."""
+
+SLOWEST_HZ = 8.0
+"""Rate of a gyroscope below which turns of a hand pass between its samples."""
+
+DIP_OFF = 0.1
+"""Median deviation (rad) of the field's dip, against the estimated vertical, from what it was at rest that is worth a
+warning: a field in buildings bends by less."""
+
 
 @dataclass(frozen=True)
 class Orientation:
@@ -50,7 +71,8 @@ class Orientation:
     attitude : Attitude
         Node to earth at the gyroscope's times, unit quaternions of continuous sign.
     variance : ndarray (N, 3), rad^2
-        What the filter believes its error to be about east, north and up; NaN where it does not say.
+        What the filter makes of its own noise model about east, north and up; NaN where it does not say. No bound:
+        linear acceleration and bent fields last longer than noise, and real errors are several times larger.
     flags : ndarray (N,), uint8
         Bits of `methods.tracking`: `ACC`, `MAG` were used, `NO_GYR`, `GAP`.
     filter, frame : str
@@ -118,11 +140,14 @@ def orient(
     chosen = find_filter(filter)
     if frame not in FRAMES:
         raise UsageError(f"there is no frame {frame!r}; choose one of {', '.join(FRAMES)}")
-    issues = list(recording.issues)
+    # what would stop a calibration (too many missing rows) is only worth a warning here
+    issues = [replace(i, level="warn") if i.level == "fail" else i for i in recording.issues]
+    recording = recording if mag else replace(recording, mag=None)
     streams, late = si_streams(recording, calibration, issues)
-    _check_sensors(recording, streams, chosen, q0, mag)
-    if not mag:
+    _check_sensors(recording, streams, chosen, q0)
+    if _no_field(streams.get("mag"), recording.source, issues):
         streams.pop("mag", None)
+    check_plausible(streams, recording, calibration, issues)
     late = delays_to_correct(delays, streams, late, recording.source, issues)
     samples = one_clock(streams, late, recording.source, issues)
     known = calibration is not None and calibration.gyr is not None
@@ -140,9 +165,10 @@ def orient(
     params = chosen.params(around)
     dt = np.diff(samples.t, prepend=samples.t[0])
     state = chosen.start(q, sd)
-    track = _run(chosen, params, state, dt, gyr, samples.acc, samples.mag, progress)
+    track = _run(chosen, params, state, dt, gyr, samples, around.dip, progress)
     figures = _figures(track, samples, bias, late, around)
     issues += _told(chosen, track, samples, "mag" in streams)
+    issues += _told_of_dip(track, samples, around.dip)
     turned = _continuous(so3.quat_multiply(from_enu, track.q))
     return Orientation(
         Attitude(samples.t, turned, parent=f"earth ({frame})", child="node"),
@@ -157,9 +183,7 @@ def orient(
     )
 
 
-def _check_sensors(
-    recording: Recording, streams: Mapping[Kind, Stream], chosen: Filter, q0: ArrayLike | None, mag: bool
-) -> None:
+def _check_sensors(recording: Recording, streams: Mapping[Kind, Stream], chosen: Filter, q0: ArrayLike | None) -> None:
     if "gyr" not in streams:
         raise InputError(f"{recording.source}: holds no gyroscope, without which no attitude can be followed")
     if "acc" not in streams and not (chosen.name == "gyro" and q0 is not None):
@@ -167,6 +191,14 @@ def _check_sensors(
             f"{recording.source}: holds no accelerometer, which tells what is up; with --filter gyro and a start "
             "attitude the gyroscope alone is integrated"
         )
+
+
+def _no_field(mag: Stream | None, source: str, issues: list[Issue]) -> bool:
+    """Whether the magnetometer shows no field at all: then there is none, and the heading is the gyroscope's."""
+    if mag is None or not np.isfinite(mag.y).any() or np.nanmax(np.abs(mag.y)) > 0:
+        return False
+    issues.append(Issue("no-field", "warn", f"{source}: the magnetometer reads zero throughout; left out", "mag"))
+    return True
 
 
 def _check_quaternion(q: Array) -> None:
@@ -206,23 +238,38 @@ def _run(
     state: Any,
     dt: Array,
     gyr: Array,
-    acc: Array,
-    mag: Array,
+    samples: Samples,
+    dip: float,
     progress: Progress | None,
 ) -> Track:
-    """The filter over all samples, in pieces where it can be paused, so that progress shows."""
-    n = len(dt)
-    if chosen.own_bias or n <= CHUNK:
+    """The filter over all samples, in pieces where it can be paused, so that progress shows; begun anew where a gap is
+    so long that the node may lie anyhow after it."""
+    n, acc, mag = len(dt), samples.acc, samples.mag
+    lost = _lost(samples.t, dt, gyr, params.gap) if chosen.corrects else []
+    if chosen.own_bias or (n <= CHUNK and not len(lost)):
         return chosen.batch(params, state, dt, gyr, acc, mag)
+    edges = np.union1d(np.arange(0, n, CHUNK), lost).astype(int)
     parts: list[Track] = []
-    for a in range(0, n, CHUNK):
-        piece = slice(a, min(a + CHUNK, n))
-        parts.append(chosen.batch(params, state, dt[piece], gyr[piece], acc[piece], mag[piece]))
+    for a, b in zip(edges, [*edges[1:], n]):
+        if parts and a in lost:
+            found = levelled(parts[-1].q[-1], samples, int(a), dip)
+            state = state if found is None else chosen.start(*found)
+        parts.append(chosen.batch(params, state, dt[a:b], gyr[a:b], acc[a:b], mag[a:b]))
         state = parts[-1].state
         if progress is not None:
-            progress(piece.stop, n)
+            progress(int(b), n)
     q, variance, flags = (np.concatenate([getattr(p, name) for p in parts]) for name in ("q", "variance", "flags"))
     return Track(q, variance, flags, state)
+
+
+def _lost(t: Array, dt: Array, gyr: Array, gap: float) -> NDArray[np.intp]:
+    """Samples before which the rate was unknown for longer than a node stays as it is."""
+    after = np.flatnonzero(dt > max(LOST_S, gap))
+    first, stop = _runs(~measured_rate(gyr))
+    inside = stop < len(t)
+    first, stop = first[inside], stop[inside]
+    blind = stop[t[stop] - t[np.maximum(first - 1, 0)] > LOST_S]
+    return np.union1d(after, blind) if len(after) < MOST_LOST * len(t) else blind[:0]
 
 
 def _continuous(q: Array) -> Array:
@@ -258,17 +305,29 @@ def _figures(
 def _told(chosen: Filter, track: Track, samples: Samples, has_mag: bool) -> list[Issue]:
     """Issues of what happened on the way."""
     issues = []
+    after = (
+        "the seconds after it are spent finding it again"
+        if chosen.corrects
+        else "what the node turned meanwhile is missing from all that follows"
+    )
+    rate = (len(samples.t) - 1) / (samples.t[-1] - samples.t[0]) if len(samples.t) > 2 else SLOWEST_HZ
+    if rate < SLOWEST_HZ:
+        text = (
+            f"the gyroscope was sampled {rate:.2g} times a second: turns pass between its samples, and the attitude is "
+            "right only while the node turns slowly; record 20 samples a second or more"
+        )
+        issues.append(Issue("slow-gyroscope", "warn", text, "gyr", rate, SLOWEST_HZ))
     gap = np.flatnonzero(track.flags & GAP)
     if len(gap):
         step = np.diff(samples.t, prepend=samples.t[0])[gap]
         text = (
             f"{len(gap)} gap{'s' if len(gap) > 1 else ''} in the gyroscope, the longest {step.max():.3g} s: the "
-            "attitude is held across each, and the seconds after it are spent finding it again"
+            f"attitude is held across each, and {after}"
         )
         issues.append(Issue("gaps", "warn", text, "gyr", float(step.max())))
     blind = _longest(samples.t, track.flags & NO_GYR > 0)
     if blind > 0:
-        text = f"the rate is not known for up to {blind:.3g} s on end: the attitude is held and found again afterwards"
+        text = f"the rate is not known for up to {blind:.3g} s on end: the attitude is held, and {after}"
         issues.append(Issue("no-rate", "warn", text, "gyr", blind))
     if not chosen.corrects:
         text = "the gyroscope alone: the attitude drifts away from the first one"
@@ -289,16 +348,48 @@ def _told_of(kind: Kind, track: Track, t: Array, bit: int, then: str) -> list[Is
     if share < 0.05 and longest < 2.0:
         return []
     text = (
-        f"the {NAMES[kind]} was not used in {100 * share:.2g} % of the samples, {longest:.3g} s on end at most "
+        f"the {NAMES[kind]} was not used in {100 * share:.3g} % of the samples, {longest:.3g} s on end at most "
         f"(missing, or not the length or direction that it should have): {then}"
     )
     return [Issue(f"{kind}-not-used", "warn", text, kind, share, 0.05)]
 
 
+def _told_of_dip(track: Track, samples: Samples, dip: float) -> list[Issue]:
+    """Whether the field keeps its angle to the vertical: it does not where an axis is mirrored, swapped or off."""
+    seen = np.flatnonzero(np.isfinite(samples.mag).all(axis=1) & (track.flags & ACC > 0))
+    seen = seen[:: max(1, len(seen) // 5000)]
+    h = to_earth(track.q[seen], samples.mag[seen])
+    level = np.hypot(h[:, 0], h[:, 1])
+    h, level = h[level + np.abs(h[:, 2]) > 0], level[level + np.abs(h[:, 2]) > 0]
+    if not len(h):
+        return []
+    issues = []
+    off = float(np.sort(np.abs(np.arctan2(-h[:, 2], level) - dip))[len(h) // 2])
+    if off > DIP_OFF:
+        text = (
+            f"the field's angle to the horizon moves with the attitude, by {math.degrees(off):.2g} deg in half of the "
+            "samples: the magnetometer is not calibrated, an axis of it is mirrored or swapped, or the field is bent; "
+            "the heading is not to be trusted"
+        )
+        issues.append(Issue("mag-disagrees", "warn", text, "mag", off, DIP_OFF))
+    elif dip < 0:
+        text = (
+            "the field points upwards, as it does south of the magnetic equator; north of it all three axes of the "
+            "magnetometer are reversed and the heading is off by 180 deg"
+        )
+        issues.append(Issue("field-upwards", "note", text, "mag", math.degrees(dip)))
+    return issues
+
+
 def _longest(t: Array, mask: Mask) -> float:
     """Seconds of the longest run of True; a single sample counts for the step before it."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    first, last = edges[::2], edges[1::2] - 1
+    first, stop = _runs(mask)
     if not len(first):
         return 0.0
-    return float(np.max(t[last] - t[np.maximum(first - 1, 0)]))
+    return float(np.max(t[stop - 1] - t[np.maximum(first - 1, 0)]))
+
+
+def _runs(mask: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First index of every run of True, and the index after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2]

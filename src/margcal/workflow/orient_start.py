@@ -10,7 +10,9 @@ import numpy as np
 from margcal.core.types import Array, Issue, Mask
 from margcal.core.units import STANDARD_GRAVITY
 from margcal.methods.filters import Surroundings
+from margcal.methods.tracking import product, rotation_step, to_earth
 from margcal.methods.wahba import triad
+from margcal.workflow.orient_streams import Samples
 
 WINDOW_S = 0.5
 """Length of the stretches that are looked at for rest."""
@@ -169,6 +171,24 @@ def first_attitude(
     heading = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0] if level[0] else [0.0, 1.0, 0.0]]
     heading_sd = sd[2] if not _has(mag) else math.pi
     return triad(np.stack([up, level]), np.array(heading)).q, (sd[0], sd[1], heading_sd)
+
+
+def levelled(q: Array, samples: Samples, k: int, dip: float) -> tuple[Array, tuple[float, float, float]] | None:
+    """Attitude `q`, held through a gap, as the readings from sample `k` on show it, and its standard deviations.
+
+    Without a usable field the heading is the one that was held. None without an accelerometer.
+    """
+    span = slice(k, max(k + 1, int(np.searchsorted(samples.t, samples.t[k] + FIRST_S, side="right"))))
+    if not _has(samples.acc[span]) or not _usable(up := _mean(samples.acc[span])):
+        return None
+    if _has(samples.mag[span]) and _usable(field := _mean(samples.mag[span])):
+        found = triad(np.stack([up, field]), _reference(dip))
+        if found.determined:
+            return found.q, (0.3, 0.3, 0.5)
+    f = to_earth(q, up / np.linalg.norm(up))
+    sine = math.hypot(f[0], f[1])
+    axis = np.array([f[1], -f[0], 0.0]) / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])  # f x up
+    return product(rotation_step(math.atan2(sine, f[2]) * axis), q), (0.3, 0.3, 1.0)
 
 
 def _reference(dip: float) -> Array:

@@ -66,9 +66,10 @@ def si_streams(
         factor = 1.0 if raw.unit == "norm" else UNITS[kind].get(raw.unit)
         if factor is None:
             what = "there is no calibration" if calibration is None else "the calibration does not hold it"
+            without = ", or go without it (--no-mag)" if kind == "mag" else ""
             raise InputError(
                 f"{recording.source}: the {NAMES[kind]} is in {raw.unit} and {what}: calibrate the node first (margcal "
-                "calibrate), or name the unit if the readings have one (--units)"
+                f"calibrate), or name the unit if the readings have one (--units){without}"
             )
         if calibration is not None:
             text = f"{recording.source}: the {NAMES[kind]} is not in the calibration; taken as it is"
@@ -101,11 +102,11 @@ def check_plausible(
             raise InputError(of if kind in calibrated else issue.text)
         if issue.code == "no-gravity" and issue.value:
             raise DataError(issue.text, (issue,))
-    ratio = turn_ratio(streams["acc"], streams["gyr"]) if _enough(streams) else None
+    ratio = turn_ratio(seen["acc"], seen["gyr"]) if _enough(streams) else None
     if ratio is not None and not 1 / TURN_RATIO < ratio < TURN_RATIO:
         text = (
             f"{where}: gravity turns {ratio:.3g} times as fast as the gyroscope says: the gyroscope is dead, of "
-            "another clock, or in another unit"
+            "another clock or unit, or its calibration is of another node or range"
         )
         raise DataError(text, (Issue("gyr-turns", "fail", text, "gyr", ratio, TURN_RATIO),))
     issues += [i for k, s in streams.items() for i in _standing(k, s, where)]

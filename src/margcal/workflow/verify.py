@@ -17,7 +17,7 @@ import numpy as np
 
 from margcal.core.errors import DataError, InputError
 from margcal.core.types import Array, Calibration, Issue, Kind, Recording, SensorModel, Stream
-from margcal.core.units import SI_COLUMN, STANDARD_GRAVITY, UNITS
+from margcal.core.units import KINDS, SI_COLUMN, STANDARD_GRAVITY, UNITS
 from margcal.workflow.verify_mistakes import Suspect, suspects
 
 Outcome = Literal["right", "mistake", "other", "cannot-tell"]
@@ -135,6 +135,11 @@ def _in_si(calibration: Calibration, recording: Recording) -> dict[Kind, Stream]
         seen = np.isfinite(stream.y).all(axis=1)
         if seen.sum() > 1:
             out[kind] = Stream(kind, stream.t[seen], stream.y[seen] * factor, wanted)
+    shared = [k for k in recording.streams if k in calibration.models]
+    if shared and not out:
+        raise InputError(
+            f"{recording.source}: {', '.join(shared)} with fewer than two readings; give the whole calibrated recording"
+        )
     if not out:
         raise InputError(
             f"{recording.source}: has readings of {', '.join(recording.streams) or 'no sensor'}, the calibration is of "
@@ -159,7 +164,12 @@ def magnitude(calibration: Calibration, kind: Kind) -> float:
 
 
 def _exact(calibration: Calibration, streams: Mapping[Kind, Stream], raw: Recording) -> Verification:
-    findings = []
+    findings, issues = [], [i for i in raw.issues if i.level != "note"]
+    missing = [k for k in KINDS if k in calibration.models and not (k in streams and k in raw.streams)]
+    if missing:
+        where = {k: "the raw" if k in streams else "the calibrated" for k in missing}
+        text = "not verified: " + ", ".join(f"{k} is not in {where[k]} recording" for k in missing)
+        issues.append(Issue("not-verified", "warn", text))
     for kind, stream in streams.items():
         model, before = calibration.models[kind], raw.streams.get(kind)
         if before is None:
@@ -178,7 +188,7 @@ def _exact(calibration: Calibration, streams: Mapping[Kind, Stream], raw: Record
         findings.append(_judge(calibration, kind, y, v))
     if not findings:
         raise InputError(f"{raw.source}: holds none of the sensors {', '.join(streams)}; give the raw recording")
-    return Verification("exact", tuple(findings))
+    return Verification("exact", tuple(findings), issues=tuple(issues))
 
 
 def _paired(stream: Stream, before: Stream, model: SensorModel) -> tuple[Array, Array]:
@@ -236,6 +246,11 @@ def _judge(calibration: Calibration, kind: Kind, y: Array, v: Array) -> Finding:
     figure = f"rms difference from H (y - B), {model.unit}"
     fits = [k for k, r in enumerate(off) if r <= limit]
     no_map = floor > max(NOT_A_MAP * spread, SAME * length)
+    right = ways[0].of(y)
+    if spread < SAME * float(np.sqrt(np.mean(np.sum((right - right.mean(axis=0)) ** 2, axis=1)))):
+        # such as zeros: it would pass for numbers of a very small unit
+        text = "the recording stands still where the raw one moves: nothing of it is in there"
+        return Finding(kind, "other", (), text, off[0], floor, limit, figure)
     if 0 in fits and not no_map:
         unseen = {w.mistakes[0]: _difference(w, ways[0], y) / length for w in (ways[k] for k in fits if k)}
         text = f"u = H (y - B), to {off[0]:.2g} {model.unit}"
