@@ -173,7 +173,7 @@ def others(rounds: int) -> dict[str, dict[str, float]]:
     grid = np.arange(t[0] + 0.15, t[-1] - 0.15, 0.05)
 
     def still() -> object:
-        return segment._windows(t, y, grid, 0.3)
+        return segment._scatter(t, y, grid, 0.3)
 
     turn, dt = rng.normal(size=(1, 200, 3)), np.full((1, 200), 0.01)
     H = (np.eye(3) + 0.1 * rng.normal(size=(19, 3, 3)))[:, None]

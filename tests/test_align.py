@@ -76,8 +76,8 @@ def test_forward_against_truth(sim: MocapSimulation, forward: Calibration) -> No
     assert values["lever_arm_m"] == pytest.approx([0.03, -0.02, 0.01], abs=1e-3)
     for kind, delay in (("acc", 0.003), ("mag", 0.011)):
         model = found.models[kind]  # type: ignore[index]
+        assert model.delay_se_s is not None and model.delay_se_s < 5e-4
         assert model.delay_s == pytest.approx(delay, abs=4 * model.delay_se_s)
-    assert found.models["acc"].delay_se_s < 1e-4
     assert found.models["gyr"].delay_s == 0.0
     H = found.models["gyr"].H
     assert pytest.approx(H.T, rel=1e-9) == H
@@ -88,8 +88,8 @@ def test_without_positions_the_low_pass_is_taken(sim: MocapSimulation) -> None:
     assert found.settings["method"] == "lowpass-svd"
     assert wrong(found, sim.gyr_symmetric, "acc") < 8e-3
     acc = found.models["acc"]
+    assert acc.delay_se_s is not None and acc.delay_se_s < 1e-3
     assert acc.delay_s == pytest.approx(0.003, abs=4 * acc.delay_se_s)
-    assert acc.delay_se_s < 1e-3
     with pytest.raises(InputError, match="positions"):
         align(sim.recording, Reference(sim.reference.t, sim.reference.q), method="forward")
 
@@ -181,7 +181,7 @@ def test_left_handed_laboratory_shows_against_accelerations(short: MocapSimulati
 
 
 def test_weak_excitation_is_told() -> None:
-    weak = simulate_mocap(seed=5, duration_s=30, rotation=0.12)
+    weak = simulate_mocap(seed=5, duration_s=40, rotation=0.12)
     for method in ("forward", "r-bsn"):
         found = align(weak.recording, weak.reference, method=method, orientation=False, allow_fail=True)  # type: ignore[arg-type]
         assert "weak-excitation" in codes(found, "warn"), method
@@ -246,10 +246,13 @@ def test_wrong_unit_is_warned_of(sim: MocapSimulation) -> None:
 # --- real recordings --------------------------------------------------------------------------------
 
 
-def broad(data_file: Data, name: str, first_s: float = 60.0) -> Calibration:
-    """The first minute of a trial."""
+def broad(data_file: Data, name: str, first_s: float = np.inf) -> Calibration:
+    """The node at half its rate, every sample the mean of two."""
     recording = read(data_file(f"broad/{name}.parquet"))
-    streams = {k: replace(s, t=s.t[s.t < first_s], y=s.y[s.t < first_s]) for k, s in recording.streams.items()}
+    streams = {}
+    for kind, s in recording.streams.items():
+        n = 2 * (np.count_nonzero(s.t < first_s) // 2)
+        streams[kind] = replace(s, t=s.t[:n].reshape(-1, 2).mean(axis=1), y=s.y[:n].reshape(-1, 2, 3).mean(axis=1))
     r = recording.reference
     assert r is not None and r.p is not None
     seen = r.t < first_s
@@ -281,7 +284,7 @@ def test_broad_is_near_the_identity(data_file: Data) -> None:
 
 
 def test_broad_without_rotation_is_refused_or_widened(data_file: Data) -> None:
-    found = broad(data_file, "12_undisturbed_slow_translation_C")
+    found = broad(data_file, "12_undisturbed_slow_translation_C", 60.0)
     assert set(found.models) == {"gyr"}
     assert "poor-excitation" in codes(found, "fail")
     error = found.models["gyr"].expected_error_deg

@@ -191,10 +191,13 @@ public:
     MARGCAL_INLINE void variance(Real out[3]) const {
         Real t[3][4];
         earth_tangents(attitude(), t);
+        MARGCAL_UNROLL
         for (int i = 0; i < 3; ++i) {
             Real cross = splat<Real>(0), square = splat<Real>(0);
+            MARGCAL_UNROLL
             for (int a = 0; a < 4; ++a) {
                 square += t[i][a] * t[i][a] * P_[at(3 + a, 3 + a)];
+                MARGCAL_UNROLL
                 for (int b = a + 1; b < 4; ++b) cross += t[i][a] * t[i][b] * P_[at(3 + a, 3 + b)];
             }
             out[i] = 4.0 * (square + 2.0 * cross);
@@ -240,6 +243,7 @@ private:
         const Real keep = z.keep, reach = z.reach;
         const Quaternion<Real> turn = rotation_step(reach * x_[0], reach * x_[1], reach * x_[2]);
         const Quaternion<Real> q = product(attitude(), turn);  // (6)
+        MARGCAL_UNROLL
         for (int i = 0; i < 3; ++i) x_[i] = keep * x_[i];
         x_[3] = q.w;
         x_[4] = q.x;
@@ -249,53 +253,72 @@ private:
         // F = [keep 0; reach half, Rt], rows of half^T in h, Rt: multiplication by `turn` from the right
         Real h[3][4];
         body_tangents(q, h);
+        MARGCAL_UNROLL
         for (int i = 0; i < 3; ++i)
+            MARGCAL_UNROLL
             for (int k = 0; k < 4; ++k) h[i][k] = 0.5 * h[i][k];
         const Real Rt[4][4] = {{turn.w, -turn.x, -turn.y, -turn.z},
                                {turn.x, turn.w, turn.z, -turn.y},
                                {turn.y, -turn.z, turn.w, turn.x},
                                {turn.z, turn.y, -turn.x, turn.w}};
         Real A[4][3], C[4][4];  // second row of F times P: columns of the rate, of the quaternion
+        MARGCAL_UNROLL
         for (int i = 0; i < 4; ++i) {
             const Real g[3] = {reach * h[0][i], reach * h[1][i], reach * h[2][i]};
+            MARGCAL_UNROLL
             for (int j = 0; j < 3; ++j) {
                 Real sum = g[0] * P_[sym(0, j)] + g[1] * P_[sym(1, j)] + g[2] * P_[sym(2, j)];
+                MARGCAL_UNROLL
                 for (int k = 0; k < 4; ++k) sum += Rt[i][k] * P_[at(j, 3 + k)];
                 A[i][j] = sum;
             }
+            MARGCAL_UNROLL
             for (int j = 0; j < 4; ++j) {
                 Real sum = g[0] * P_[at(0, 3 + j)] + g[1] * P_[at(1, 3 + j)] + g[2] * P_[at(2, 3 + j)];
+                MARGCAL_UNROLL
                 for (int k = 0; k < 4; ++k) sum += Rt[i][k] * P_[sym(3 + k, 3 + j)];
                 C[i][j] = sum;
             }
         }
         const Real keep_square = keep * keep;
+        MARGCAL_UNROLL
         for (int i = 0; i < 3; ++i) {
+            MARGCAL_UNROLL
             for (int j = i; j < 3; ++j) P_[at(i, j)] = keep_square * P_[at(i, j)];
             P_[at(i, i)] += z.Q_ww;
+            MARGCAL_UNROLL
             for (int k = 0; k < 4; ++k) P_[at(i, 3 + k)] = keep * A[k][i] + z.Q_wt * h[i][k];
         }
+        MARGCAL_UNROLL
         for (int i = 0; i < 4; ++i)
+            MARGCAL_UNROLL
             for (int j = i; j < 4; ++j) {
                 Real sum = reach * (A[i][0] * h[0][j] + A[i][1] * h[1][j] + A[i][2] * h[2][j]);
+                MARGCAL_UNROLL
                 for (int k = 0; k < 4; ++k) sum += C[i][k] * Rt[j][k];
                 P_[at(3 + i, 3 + j)] = sum;
             }
+        MARGCAL_UNROLL
         for (int i = 3; i < 7; ++i) P_[at(i, i)] += 0.25 * z.Q_tt;
     }
 
     // Kalman correction by z = x[ROW] + noise of variance R (infinite: not taken), (8).
     template <int ROW> MARGCAL_INLINE void correct(Real z, Real R) {
         Real p[7];
+        MARGCAL_UNROLL
         for (int i = 0; i < 7; ++i) p[i] = P_[sym(i, ROW)];
         apply_gain(p, splat<Real>(1) / (p[ROW] + R), z - x_[ROW]);
     }
 
     MARGCAL_INLINE void apply_gain(const Real p[7], Real inverse, Real innovation) {
         Real gain[7];
+        MARGCAL_UNROLL
         for (int i = 0; i < 7; ++i) gain[i] = p[i] * inverse;
+        MARGCAL_UNROLL
         for (int i = 0; i < 7; ++i) x_[i] += gain[i] * innovation;
+        MARGCAL_UNROLL
         for (int i = 0; i < 7; ++i)
+            MARGCAL_UNROLL
             for (int j = i; j < 7; ++j) P_[at(i, j)] -= gain[i] * p[j];
     }
 

@@ -73,7 +73,7 @@ template <class Filter, class Real> inline void filter_nodes(const FilterJob& jo
     for (std::size_t i = 0; i < Filter::STATE; ++i) state[i] = memory.template get<Real>(i);
     filter.begin(params, state);
     for (std::size_t k = 0; k < n; ++k) {
-        Reading<Real> reading{};
+        Reading<Real> reading;
         reading.dt = dt.template get<Real>(k);
         for (std::size_t c = 0; c < 3; ++c) {
             reading.gyr[c] = gyr.template get<Real>(3 * k + c);

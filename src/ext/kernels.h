@@ -7,7 +7,8 @@
 
 namespace margcal {
 
-// Median of the n - 1 steps of t; work holds n - 1 doubles.
+// Median of the n - 1 steps of t, NaN unless times are finite and do not run backwards; work holds n + MOST_LANES
+// doubles.
 double median_step(const double* t, std::size_t n, double* work);
 
 // One turn and the hypotheses to integrate it with.
@@ -45,19 +46,36 @@ struct FilterJob {
 
 constexpr std::size_t SCATTER_BLOCK = 256;
 
+// Windows of a recording, rows lo[j] to hi[j] of y (n, 3), of which each needs at least `enough` rows.
+struct ScatterJob {
+    const double* y;
+    std::size_t n;
+    const std::size_t *lo, *hi;
+    std::size_t m;
+    double enough;
+};
+
+// How many steps of a clock are less than a bracket's lower value, not more, inside (both values left out), more than
+// the upper one; and how many do not run backwards.
+struct StepCounts {
+    std::size_t below, upto_low, inside, above, forward;
+};
+
 // Kernels that exist once for every set of vector instructions.
 struct LaneKernels {
     const char* name;
     // u = H (y - B) for n rows of three; u may be y itself
     void (*apply)(const double* y, std::size_t n, const double* H, const double* B, double* u);
-    // rows[j]: number of ascending times t that lie before centres[j] + shift (centres ascend)
-    void (*rows_before)(const double* t, std::size_t n, const double* centres, std::size_t m, double shift,
-                        std::size_t* rows);
-    // Scatter (norm over the axes) and mean of rows lo[j] to hi[j] of y; NaN where there are fewer than four, or less
-    // than half of `expected`. The ring holds mask + 1 >= longest window + SCATTER_BLOCK + 1 times four doubles, a power
-    // of two, of which the first four are zero.
-    void (*scatter)(const double* y, std::size_t n, const std::size_t* lo, const std::size_t* hi, std::size_t m,
-                    double expected, double* ring, std::size_t mask, double* sd, double* mean);
+    // Steps inside the bracket are set apart in `inside`, which holds MOST_LANES more than there are steps.
+    StepCounts (*count_steps)(const double* t, std::size_t steps, double low, double high, double* inside);
+    // lo[j], hi[j]: the rows whose (ascending) times lie from centres[j] - half to centres[j] + half, which ascend too;
+    // returns the most rows of one window
+    std::size_t (*window_rows)(const double* t, std::size_t n, const double* centres, std::size_t m, double half,
+                               std::size_t* lo, std::size_t* hi);
+    // Scatter of each window (norm over the axes), NaN where it has too few rows. `offset` (3,) is a value near the
+    // readings. The ring is scratch, mask + 1 times four doubles; mask + 1, a power of two, is more than the rows of the
+    // longest window and SCATTER_BLOCK together.
+    void (*scatter)(const ScatterJob& job, const double* offset, double* ring, std::size_t mask, double* sd);
     void (*pack)(const TurnView& turn, double* packed);
     void (*integrate)(const double* packed, std::size_t n, const SensorView& sensor, double q[4]);
     void (*preintegrate)(const double* packed, std::size_t n, const SensorView& sensor, const double noise[9],

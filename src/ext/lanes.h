@@ -33,6 +33,13 @@ typedef decltype(Lanes{} < Lanes{}) Mask;
 
 #define MARGCAL_INLINE inline __attribute__((always_inline))
 
+// Before a loop over rows or columns of small matrices: without it their places are worked out again and again.
+#if defined(__clang__)
+#define MARGCAL_UNROLL _Pragma("unroll")
+#else
+#define MARGCAL_UNROLL _Pragma("GCC unroll 8")
+#endif
+
 MARGCAL_INLINE Lanes fill(double x) { return Lanes{} + x; }
 
 MARGCAL_INLINE Lanes load(const double* p) {

@@ -2,6 +2,7 @@
 #include "ekf_quest_one.h"
 #include "rows.h"
 #include "selection.h"
+#include "steps.h"
 #include "still.h"
 #include "strapdown.h"
 #include "turns.h"
@@ -18,7 +19,7 @@ constexpr auto ekf_one = filter_one<EkfQuest>;
 #endif
 
 extern const LaneKernels table;
-const LaneKernels table = {MARGCAL_TEXT(MARGCAL_LEVEL), apply, rows_before, scatter,
+const LaneKernels table = {MARGCAL_TEXT(MARGCAL_LEVEL), apply, count_steps, window_rows, scatter,
                            pack, integrate, preintegrate, filter_all<EkfQuest, ekf_one>,
                            filter_all<VectorSelection, filter_one<VectorSelection>>,
                            filter_all<Strapdown, filter_one<Strapdown>>};

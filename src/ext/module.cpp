@@ -30,29 +30,42 @@ void need_ascending(const double* t, std::size_t n, const char* name) {
     if (!ascending) throw nb::value_error((std::string(name) + ": times must be finite and not run backwards").c_str());
 }
 
-void bind_moving_scatter(const In& t, const In& y, const In& centres, double width, const Out& sd, const Out& mean) {
+// Mean of at most some thousand rows all over the recording.
+void mean_row(const double* y, std::size_t n, double mean[3]) {
+    const std::size_t step = 1 + n / 1024;
+    std::size_t rows = 0;
+    mean[0] = mean[1] = mean[2] = 0;
+    for (std::size_t i = 0; i < n; i += step, ++rows)
+        for (std::size_t k = 0; k < 3; ++k) mean[k] += y[3 * i + k];
+    for (std::size_t k = 0; k < 3; ++k) mean[k] /= double(rows);
+}
+
+void bind_moving_scatter(const In& t, const In& y, const In& centres, double width, const Out& sd) {
     const double* time = need<const double>(t, "t", {ANY});
     const auto n = std::int64_t(t.shape(0)), m = std::int64_t(centres.size());
     const double* readings = need<const double>(y, "y", {n, 3});
     const double* middle = need<const double>(centres, "centres", {ANY});
-    double *scatter = need<double>(sd, "sd", {m}), *average = need<double>(mean, "mean", {m, 3});
+    double* scatter = need<double>(sd, "sd", {m});
     if (n < 2) throw nb::value_error("t: at least two samples are needed");
     if (!(width > 0)) throw nb::value_error("width: must be positive");
     nb::gil_scoped_release unlocked;
-    need_ascending(time, std::size_t(n), "t");
+    const std::unique_ptr<double[]> work(new double[std::size_t(n) + MOST_LANES]);
+    const double usual = median_step(time, std::size_t(n), work.get());
+    if (usual != usual) throw nb::value_error("t: times must be finite and not run backwards");
     need_ascending(middle, std::size_t(m), "centres");
     const LaneKernels& kernels = lane_kernels();
-    std::vector<std::size_t> lo(static_cast<std::size_t>(m)), hi(lo.size());
-    kernels.rows_before(time, std::size_t(n), middle, lo.size(), -width / 2, lo.data());
-    kernels.rows_before(time, std::size_t(n), middle, hi.size(), width / 2, hi.data());
-    std::size_t longest = 0, size = 1;
-    for (std::size_t j = 0; j < lo.size(); ++j) longest = std::max(longest, hi[j] - lo[j]);
+    const std::unique_ptr<std::size_t[]> rows(new std::size_t[std::size_t(2 * m)]);
+    ScatterJob job{readings, std::size_t(n), rows.get(), rows.get() + m, std::size_t(m), 0};
+    const std::size_t longest =
+        kernels.window_rows(time, job.n, middle, job.m, width / 2, rows.get(), rows.get() + m);
+    std::size_t size = 1;
     while (size < longest + SCATTER_BLOCK + 1) size *= 2;
-    std::vector<double> ring(4 * size);
-    const std::unique_ptr<double[]> work(new double[std::size_t(n - 1)]);
-    const double expected = width / median_step(time, std::size_t(n), work.get());
-    kernels.scatter(readings, std::size_t(n), lo.data(), hi.data(), lo.size(), expected, ring.data(), size - 1, scatter,
-                    average);
+    const std::unique_ptr<double[]> ring(new double[4 * size]);
+    const double half_of_usual = 0.5 * (width / usual);
+    job.enough = half_of_usual > 4 ? half_of_usual : 4;
+    double offset[3];
+    mean_row(readings, job.n, offset);
+    kernels.scatter(job, offset, ring.get(), size - 1, scatter);
 }
 
 // Samples of a turn without the padding (no interval) at its end.
@@ -163,7 +176,7 @@ NB_MODULE(_ext, m) {
     using namespace margcal;
     m.doc() = "Compiled kernels of margcal; reach them through margcal.core.compiled.";
     m.def("apply", &bind_apply, "y"_a, "H"_a, "B"_a, "out"_a);
-    m.def("moving_scatter", &bind_moving_scatter, "t"_a, "y"_a, "centres"_a, "width"_a, "sd"_a, "mean"_a);
+    m.def("moving_scatter", &bind_moving_scatter, "t"_a, "y"_a, "centres"_a, "width"_a, "sd"_a);
     m.def("integrate", &bind_integrate, "y"_a, "dt"_a, "H"_a, "B"_a, "turn"_a, "sensor"_a, "out"_a);
     m.def("preintegrate", &bind_preintegrate, "y"_a, "dt"_a, "H"_a, "B"_a, "noise"_a, "dR"_a, "J_H"_a, "J_B"_a, "C"_a);
     define_filter(m, "ekf_quest", &bind_filter<&LaneKernels::ekf_quest, 10, 56>);

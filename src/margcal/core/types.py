@@ -35,14 +35,14 @@ Verdict = Literal["pass", "warn", "fail"]
 
 
 def _frozen(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
-    """A read-only float64 copy of `value` whose trailing axes have `shape` (None: any length).
+    """A read-only, C-contiguous float64 copy of `value` whose trailing axes have `shape` (None: any length).
 
-    An array that is read-only already is taken as it is: streams of 1e7 rows are not copied at every door.
+    An array that is all this already is taken as it is: streams of 1e7 rows are not copied at every door.
     """
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and not value.flags.writeable:
-        array = value
+        array = np.asarray(value, order="C")
     else:
-        array = np.array(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64, order="C")
     tail = array.shape[array.ndim - len(shape) :] if array.ndim >= len(shape) else None
     if tail is None or any(want is not None and want != have for want, have in zip(shape, tail)):
         wanted = ", ".join("n" if n is None else str(n) for n in shape)
@@ -147,7 +147,7 @@ _BLOCK, _LANES = 4096, 4
 
 
 def _apply_blocks(y: Array, H: Array, B: Array) -> Array:
-    """``(y - B) @ H.T`` in one pass over memory, twice as fast on long recordings, to the same last bit.
+    """``(y - B) @ H.T`` in one pass over memory, twice as fast on long recordings.
 
     Matrix libraries are slow on products three wide, so `_LANES` rows are taken as one and multiplied by a
     block-diagonal H. A value that is not finite would spread to its neighbours (0 * NaN): such blocks are done

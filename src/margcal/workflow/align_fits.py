@@ -97,7 +97,7 @@ def solve_right(job: AlignJob, tick: Tick) -> AlignSolved:
         _attempt(solved, "acc", lambda: _accelerometer(job, solved), fits)
     tick(8, 9)
     if "gyr" not in fits:
-        raise DataError(solved.issues[-1].text, solved.issues)
+        raise DataError(next(i.text for i in solved.issues if i.sensor == "gyr" and i.level == "fail"), solved.issues)
     _same_handed(job, fits)
     frame = common_frame(fits["gyr"], fits.get("acc"), fits.get("mag"))
     _take_frame(job, solved, frame, fits)

@@ -245,19 +245,25 @@ def _run(
     """The filter over all samples, in pieces where it can be paused, so that progress shows; begun anew where a gap is
     so long that the node may lie anyhow after it."""
     n, acc, mag = len(dt), samples.acc, samples.mag
-    lost = _lost(samples.t, dt, gyr, params.gap) if chosen.corrects else []
+    lost = _lost(samples.t, dt, gyr, params.gap) if chosen.corrects else np.zeros(0, dtype=np.intp)
     if chosen.own_bias or (n <= CHUNK and not len(lost)):
         return chosen.batch(params, state, dt, gyr, acc, mag)
     edges = np.union1d(np.arange(0, n, CHUNK), lost).astype(int)
     parts: list[Track] = []
-    for a, b in zip(edges, [*edges[1:], n]):
-        if parts and a in lost:
-            found = levelled(parts[-1].q[-1], samples, int(a), dip)
-            state = state if found is None else chosen.start(*found)
-        parts.append(chosen.batch(params, state, dt[a:b], gyr[a:b], acc[a:b], mag[a:b]))
-        state = parts[-1].state
+    anew, usual = set(lost.tolist()), float(np.sort(dt)[n // 2])
+    for a, b in zip(edges.tolist(), [*edges[1:].tolist(), n]):
+        found = levelled(parts[-1].q[-1], samples, a, dip) if parts and a in anew else None
+        if found is None:
+            part = chosen.batch(params, state, dt[a:b], gyr[a:b], acc[a:b], mag[a:b])
+        else:  # the gap is over: its length must not count again
+            steps = dt[a:b].copy()
+            steps[0] = min(steps[0], usual)
+            part = chosen.batch(params, chosen.start(*found), steps, gyr[a:b], acc[a:b], mag[a:b])
+            part.flags[0] |= GAP * np.uint8(dt[a] > params.gap)
+        parts.append(part)
+        state = part.state
         if progress is not None:
-            progress(int(b), n)
+            progress(b, n)
     q, variance, flags = (np.concatenate([getattr(p, name) for p in parts]) for name in ("q", "variance", "flags"))
     return Track(q, variance, flags, state)
 
@@ -344,7 +350,8 @@ def _told(chosen: Filter, track: Track, samples: Samples, has_mag: bool) -> list
 
 def _told_of(kind: Kind, track: Track, t: Array, bit: int, then: str) -> list[Issue]:
     unused = track.flags & bit == 0
-    share, longest = float(np.mean(unused)), _longest(t, unused)
+    # a sample after a gap does not count for the time that is missing before it
+    share, longest = float(np.mean(unused)), _longest(t, unused & (track.flags & GAP == 0))
     if share < 0.05 and longest < 2.0:
         return []
     text = (

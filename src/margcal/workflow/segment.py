@@ -128,27 +128,26 @@ def measured(recording: Recording) -> Recording:
 # --- stillness ---------------------------------------------------------------------------------------
 
 
-def _windows(t: Array, y: Array, centres: Array, width: float) -> tuple[Array, Array]:
-    """Scatter (norm over the axes) and mean of the samples within `width` s of each centre; NaN where fewer
-    than four samples or a gap lie there."""
+def _scatter(t: Array, y: Array, centres: Array, width: float) -> Array:
+    """Scatter (norm over the axes) of the samples within `width` s of each centre; NaN where fewer than four
+    samples or a gap lie there."""
     kernels = compiled.extension()
     if kernels is not None and len(t) > 1 and width > 0:
-        sd, mean = np.empty(len(centres)), np.empty((len(centres), 3))
-        kernels.moving_scatter(t, np.ascontiguousarray(y), centres, width, sd, mean)
-        return sd, mean
+        sd = np.empty(len(centres))
+        kernels.moving_scatter(t, np.ascontiguousarray(y), centres, width, sd)
+        return sd
     lo = np.searchsorted(t, centres - width / 2)
     hi = np.searchsorted(t, centres + width / 2)
     n = hi - lo
-    y = y - y.mean(axis=0)  # sums of squares stay small beside their variance
+    y = y - y[:: 1 + len(y) // 1024].mean(axis=0)  # sums of squares stay small beside their variance
     sums = np.vstack([np.zeros(3), np.cumsum(y, axis=0)])
-    squares = np.concatenate([[0.0], np.cumsum(np.einsum("ni,ni->n", y, y))])
-    count = np.maximum(n, 1)
-    mean = (sums[hi] - sums[lo]) / count[:, None]
-    variance = (squares[hi] - squares[lo]) / count - np.einsum("ni,ni->n", mean, mean)
-    sd = np.sqrt(np.maximum(variance, 0.0) * count / np.maximum(count - 1, 1))
+    squares = np.concatenate([[0.0], np.cumsum(y[:, 0] ** 2 + y[:, 1] ** 2 + y[:, 2] ** 2)])
+    total = sums[hi] - sums[lo]
+    within = squares[hi] - squares[lo] - np.einsum("ni,ni->n", total, total) / np.maximum(n, 1)
+    sd = np.sqrt(np.maximum(within, 0.0) / np.maximum(n - 1, 1))
     expected = width / np.median(np.diff(t))
     sd[(n < 4) | (n < 0.5 * expected)] = np.nan
-    return sd, mean
+    return sd
 
 
 def noise_floor(stream: Stream) -> float:
@@ -163,9 +162,9 @@ def noise_floor(stream: Stream) -> float:
     if len(t) < 8 or t[-1] - t[0] < MIN_REST_S:
         return float("nan")
     centres = np.arange(t[0] + 0.5, t[-1] - 0.5 + 1e-9, 5 * STEP_S)
-    slow, _ = _windows(t, y, centres, 1.0)
+    slow = _scatter(t, y, centres, 1.0)
     curvature = (y[:-2] - 2 * y[1:-1] + y[2:]) / np.sqrt(6.0)  # white noise keeps its sd, motion vanishes
-    fast, _ = _windows(t[1:-1], curvature, centres, 1.0)
+    fast = _scatter(t[1:-1], curvature, centres, 1.0)
     if not np.isfinite(slow).any():
         return float("nan")
     floor = float(np.nanquantile(slow, FLOOR_QUANTILE))
@@ -199,7 +198,7 @@ def _still(recording: Recording, floors: Floors, ratio: float) -> tuple[Array, A
     grid = np.arange(start + WINDOW_S / 2, stop - WINDOW_S / 2 + 1e-9, STEP_S)
     still = np.ones(len(grid), dtype=bool)
     for stream in streams:
-        sd, _ = _windows(stream.t, stream.y, grid, max(WINDOW_S, 8 / stream.rate))
+        sd = _scatter(stream.t, stream.y, grid, max(WINDOW_S, 8 / stream.rate))
         with np.errstate(invalid="ignore"):
             still &= sd < ratio * floors[stream.kind]  # NaN is never still
     return grid, still

@@ -138,7 +138,8 @@ def _in_si(calibration: Calibration, recording: Recording) -> dict[Kind, Stream]
     shared = [k for k in recording.streams if k in calibration.models]
     if shared and not out:
         raise InputError(
-            f"{recording.source}: {', '.join(shared)} with fewer than two readings; give the whole calibrated recording"
+            f"{recording.source}: {', '.join(shared)} with fewer than two readings; give the whole "
+            "recording of the calibrated node"
         )
     if not out:
         raise InputError(
