@@ -325,3 +325,12 @@ def test_calibrate_says_the_magnetometers_delay_and_apply_takes_it_out(late, tmp
     expected, raw = (v[np.isin(mag.t, mended.t)] for v in (expected, found.mag.apply(y)))
     rms = [float(np.sqrt(np.mean((v - expected) ** 2))) for v in (raw, mended.y)]
     assert rms[1] < 0.3 * rms[0]
+
+
+@pytest.mark.parametrize("poses", ["cube", "swing", "mocap"])
+@pytest.mark.parametrize("noise", ["nan", "-1", "inf"])
+def test_no_node_is_simulated_with_noise_that_is_no_factor(poses, noise, tmp_path, capsys):
+    options = ["--noise", noise, "--rate", "50"]
+    assert command(["simulate", "--poses", poses, *options, "-o", str(tmp_path / "s")]) == 1
+    assert "noise is" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from margcal.core import so3
+from margcal.core.errors import InputError
 from margcal.core.types import Array, Calibration, Kind, Reference, SensorModel, Stream
 from margcal.core.units import KINDS, STANDARD_GRAVITY
 from margcal.methods.sensor_model import ErrorParameters, compose
@@ -139,6 +140,8 @@ def readings(
     quantise : bool
         Round to whole counts and saturate at 16 bits.
     """
+    if not 0 <= noise < np.inf:
+        raise InputError(f"noise is {noise}; it must be zero or above")
     streams: dict[Kind, Stream] = {}
     generators = dict(zip(KINDS, rng.spawn(3)))
     last: tuple[Array, State] | None = None
