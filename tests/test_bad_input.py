@@ -658,9 +658,7 @@ CASES = [
     Case("gravity-nan", "67", 2, options=("--gravity", "nan"), says=("gravity",)),
     # row 69: solvers by name, on data that they cannot work with
     *(
-        Case(
-            f"method-{m}", "69", 0, made=few(14), options=("--method", m)
-        )
+        Case(f"method-{m}", "69", 0, made=few(14), options=("--method", m))
         for m in ("one-step", "ellipsoid", "eigen", "ukf")
     ),
     Case("method-unknown", "69", 2, options=("--method", "magic"), says=("gls-ml",)),

@@ -399,9 +399,7 @@ def test_ctrl_c_exits_with_130_and_leaves_no_half_file(calibrated, tmp_path):
     command = [*MARGCAL, "apply", str(calibrated), str(tmp_path / "long.parquet"), "-o", str(tmp_path / "out.csv")]
     # a test run in the background of a shell inherits SIGINT as ignored: give the command what a terminal would
     heeding = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heeding
-    )
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heeding)
     deadline = time.monotonic() + 60
     while not any(p.name.startswith(".") for p in tmp_path.iterdir()):
         assert process.poll() is None and time.monotonic() < deadline

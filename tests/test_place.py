@@ -107,9 +107,7 @@ def test_heights_off_the_earth_are_refused():
         field(0, 0, 2026, float("nan"))
 
 
-@pytest.mark.parametrize(
-    "text, level", [("86,150,2026", "warn"), ("80,150,2026", "note"), ("60,10,2026", None)]
-)
+@pytest.mark.parametrize("text, level", [("86,150,2026", "warn"), ("80,150,2026", "note"), ("60,10,2026", None)])
 def test_near_a_magnetic_pole_it_warns(text, level):
     issues = parse_at(text).issues
     assert [i.level for i in issues] == ([level] if level else [])

@@ -69,9 +69,7 @@ def test_the_gyroscope_integrates_to_the_attitudes(rate, limit_deg):
         assert np.degrees(error) < limit_deg
 
 
-@pytest.mark.parametrize(
-    "make", [lambda: simulate(seed=5, n_poses=4, knocks=3, **CLEAN), lambda: swing(**CLEAN)]
-)
+@pytest.mark.parametrize("make", [lambda: simulate(seed=5, n_poses=4, knocks=3, **CLEAN), lambda: swing(**CLEAN)])
 def test_the_rate_is_the_derivative_of_the_attitude(make):
     sim = make()
     t, h = np.linspace(0.01, sim.recording.gyr.t[-1] - 0.01, 5000), 1e-5
