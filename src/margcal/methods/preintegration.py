@@ -35,6 +35,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -156,46 +158,48 @@ def _compiled_quat(y: ArrayLike, dt: ArrayLike, H: ArrayLike, B: ArrayLike) -> A
     if kernels is None or y.size == 0 or dt.size == 0:
         return None
     H, B = np.asarray(H, dtype=np.float64), np.asarray(B, dtype=np.float64)
-    samples = max(y.shape[-2], dt.shape[-1])
-    turns = _common(y.shape[:-2], dt.shape[:-1])
-    sensors = _common(H.shape[:-2], B.shape[:-1])
-    lead = _common(turns, sensors)
-    out = np.empty((math.prod(lead), 4))
-    kernels.integrate(
-        _flat(y, turns, (samples, 3)),
-        _flat(dt, turns, (samples,)),
-        _flat(H, sensors, (3, 3)),
-        _flat(B, sensors, (3,)),
-        _index(turns, lead),
-        _index(sensors, lead),
-        out,
-    )
-    return out.reshape(*lead, 4)
+    plan = _plan(y.shape, dt.shape, H.shape, B.shape)
+    out = np.empty(plan.out)
+    y, dt, H, B = (_flat(a, wide, flat) for a, (wide, flat) in zip((y, dt, H, B), plan.shapes))
+    kernels.integrate(y, dt, H, B, plan.turn, plan.sensor, out.reshape(-1, 4))
+    return out
 
 
-def _common(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    """`np.broadcast_shapes`, quick where there is nothing to do: it costs as much as a turn."""
-    return a if a == b or not b else b if not a else np.broadcast_shapes(a, b)
+Shape = tuple[int, ...]
 
 
-def _flat(a: Array, lead: tuple[int, ...], tail: tuple[int, ...]) -> Array:
-    """`a` broadcast to leading axes `lead`, those as one, in contiguous memory."""
-    shape = (*lead, *tail)
-    if a.shape != shape:
-        wide = np.empty(shape)
-        wide[...] = a
-        a = wide
-    return np.ascontiguousarray(a).reshape(math.prod(lead), *tail)
+class _Plan(NamedTuple):
+    """How arrays of given shapes meet: shape of the result, of each array broadcast and then flat, and the indices."""
+
+    out: Shape
+    shapes: tuple[tuple[Shape, Shape], ...]
+    turn: Index
+    sensor: Index
 
 
-def _index(own: tuple[int, ...], lead: tuple[int, ...]) -> Index:
+@lru_cache(maxsize=16)  # the same shapes come in every iteration, and finding out costs more than a turn of 200 samples
+def _plan(y: Shape, dt: Shape, H: Shape, B: Shape) -> _Plan:
+    samples = max(y[-2], dt[-1])
+    turns, sensors = np.broadcast_shapes(y[:-2], dt[:-1]), np.broadcast_shapes(H[:-2], B[:-1])
+    lead = np.broadcast_shapes(turns, sensors)
+
+    def shapes(own: Shape, *tail: int) -> tuple[Shape, Shape]:
+        return (*own, *tail), (math.prod(own), *tail)
+
+    wanted = shapes(turns, samples, 3), shapes(turns, samples), shapes(sensors, 3, 3), shapes(sensors, 3)
+    return _Plan((*lead, 4), wanted, _index(turns, lead), _index(sensors, lead))
+
+
+def _flat(a: Array, wide: Shape, flat: Shape) -> Array:
+    """`a` broadcast to shape `wide`, then as `flat`, in contiguous memory."""
+    if a.shape != wide:
+        a = np.broadcast_to(a, wide)
+    return np.ascontiguousarray(a).reshape(flat)
+
+
+def _index(own: Shape, lead: Shape) -> Index:
     """For each element of shape `lead` the flat index of the element of shape `own` that broadcasts to it."""
-    count, wanted = math.prod(own), math.prod(lead)
-    if count == wanted:
-        return np.arange(count)
-    if count == 1:
-        return np.zeros(wanted, dtype=np.int64)
-    return np.broadcast_to(np.arange(count).reshape(own), lead).ravel()
+    return np.broadcast_to(np.arange(math.prod(own)).reshape(own), lead).flatten()
 
 
 def _multiply(a: Array, b: Array) -> Array:
