@@ -10,8 +10,8 @@ mounting x non-orthogonality x scale; a magnetometer's H also holds the soft iro
 Frames
     `h` the node, `n` the earth (ENU: x east, y magnetic north, z up). `R_ab` takes components from b to a:
     ``v_a = R_ab @ v_b``. Which frame h is depends on how the node was put down and is in the file as `frame`:
-    `housing`, `marker` or `acc-triangular`. Quaternions are scalar first; table columns `qw qx qy qz` mean h to
-    earth or laboratory.
+    `housing`, `marker`, `acc-triangular` or (from `align`) `gyr-symmetric`. Quaternions are scalar first; table
+    columns `qw qx qy qz` mean h to earth or laboratory.
 Signs
     `acc` is specific force: at rest +g on the axis that points up. Accelerometers have det H > 0 unless a nominal
     H says otherwise; a magnetometer's sign comes from a nominal H, from the dip of a known place, or is assumed
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from margcal.workflow.align import align
     from margcal.workflow.calibrate import calibrate
     from margcal.workflow.evaluate import evaluate
+    from margcal.workflow.export import export
+    from margcal.workflow.importing import import_calibration
     from margcal.workflow.orient import orient
     from margcal.workflow.segment import find_poses
     from margcal.workflow.simulate import simulate
@@ -83,6 +85,8 @@ __all__ = [
     "verify",
     "simulate",
     "orient",
+    "export",
+    "import_calibration",
     "MargcalError",
     "InputError",
     "UsageError",
@@ -112,6 +116,8 @@ _HOME = {
     "verify": "workflow.verify",
     "simulate": "workflow.simulate",
     "orient": "workflow.orient",
+    "export": "workflow.export",
+    "import_calibration": "workflow.importing",
     "MargcalError": "core.errors",
     "InputError": "core.errors",
     "UsageError": "core.errors",

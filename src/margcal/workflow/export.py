@@ -16,6 +16,7 @@ from margcal.core.errors import DataError, UsageError
 from margcal.core.types import Array, Calibration, Issue
 from margcal.core.units import KINDS, UNITS, Kind
 from margcal.files.exchange.fitting import ORIENTATIONS, lower_frame, nearest, orientation_of
+from margcal.files.exchange.registry import find
 from margcal.files.exchange.target import Form, Matrix, Page, Sensor, Target
 from margcal.methods.uncertainty import direction_errors_deg, sphere
 from margcal.workflow.export_units import Converted, converted, field_strength
@@ -81,7 +82,7 @@ class Export:
 
 def export(
     calibration: Calibration,
-    target: Target,
+    target: Target | str,
     *,
     sensors: Collection[Kind] | None = None,
     scale: Mapping[str, float] | None = None,
@@ -94,6 +95,8 @@ def export(
 
     Parameters
     ----------
+    target : Target or str
+        A name in `files.exchange.registry.TARGETS`, such as ``'c'`` or ``'imucal'``.
     sensors : kinds, optional
         Only these; without it, all that the target has a place for.
     scale : mapping of kind to float, optional
@@ -112,6 +115,7 @@ def export(
     UsageError
         Options that do not fit the target.
     """
+    target = find(target) if isinstance(target, str) else target
     _refuse_odd_limits(max_loss_deg, field_uT)
     kinds, left_out = _chosen(calibration, target, sensors)
     _refuse_foreign_scale(

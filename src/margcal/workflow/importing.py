@@ -17,6 +17,7 @@ from margcal.core.types import Array, Calibration, Issue, SensorModel
 from margcal.core.units import KINDS, SI_COLUMN, SI_UNIT, UNITS, Kind
 from margcal.files.calfile import check_model
 from margcal.files.exchange import texts
+from margcal.files.exchange.registry import find
 from margcal.files.exchange.target import MAX_BYTES, Form, Page, Sensor, Target
 
 VECTORS_AGREE = 1e-6
@@ -28,7 +29,7 @@ _UNIT_NAMES = {"m/s^2": "mps2", "m/s2": "mps2", "rad/s": "radps", "deg/s": "dps"
 def import_calibration(
     data: bytes,
     name: str,
-    source: Target,
+    source: Target | str,
     *,
     sensors: Sequence[Kind] = (),
     units: Mapping[str, str] | None = None,
@@ -43,6 +44,8 @@ def import_calibration(
     ----------
     data, name : bytes, str
         The file, and what messages call it.
+    source : Target or str
+        A name in `files.exchange.registry.TARGETS`.
     sensors : kinds
         Which sensor the file is of, where it does not say; otherwise only these are taken.
     units : mapping of kind to unit
@@ -59,6 +62,7 @@ def import_calibration(
     DataError
         A sensor that was asked for is not in it.
     """
+    source = find(source) if isinstance(source, str) else source
     if len(data) > MAX_BYTES:
         raise InputError(f"{name}: is larger than {MAX_BYTES // 1000} kB; this is no calibration")
     for option, given in (("--units", units), ("--unit", unit), ("--scale", scale)):
