@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from margcal.apps import screen
-from margcal.apps.calibrating import as_plain, parse_sensors, read_one
+from margcal.apps.calibrating import as_plain, parse_sensors, read_one, write_results
 from margcal.apps.outputs import check_outputs
 from margcal.core import so3
 from margcal.core.errors import DataError, InputError
@@ -65,7 +65,8 @@ def run(
         asked["static"] = read_one(static, reading)
     calibration, failure = _aligned(node, asked)
     calibration = _with_files(calibration, inputs)
-    written = _write(calibration, output if failure is None or allow_fail else None, report, overwrite)
+    keep = calibration.models and (failure is None or allow_fail)
+    written = write_results(calibration, output if keep else None, report, overwrite)
     if as_json:
         print(
             json.dumps(
@@ -117,22 +118,6 @@ def _with_files(calibration: Calibration, inputs: list[str]) -> Calibration:
     extra = [p for p in inputs if Path(p).is_file()]
     paths = {os.path.realpath(p): p for p in [*found, *extra]}
     return replace(calibration, files=digests(paths.values()))
-
-
-def _write(calibration: Calibration, output: str | None, report: str | None, overwrite: bool) -> dict[str, str]:
-    written: dict[str, str] = {}
-    if report is not None:
-        from margcal.apps.report import write_report
-
-        with screen.progress("writing the report"):
-            write_report(calibration, report, overwrite=overwrite)
-        written["report"] = report
-    if output is not None and calibration.models:
-        from margcal.files.calfile import save
-
-        save(calibration, output, overwrite=overwrite)
-        written["calibration"] = output
-    return written
 
 
 # --- what people and programs see -------------------------------------------------------------------

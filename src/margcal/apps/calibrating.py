@@ -52,7 +52,7 @@ def run(
         asked["nominal"] = load(nominal)
     read_in = tuple(read_one(path, reading) for path in recordings)
     calibration, failure = _calibrated(read_in, asked)
-    written = _write(calibration, output if failure is None or allow_fail else None, report, overwrite)
+    written = write_results(calibration, output if failure is None or allow_fail else None, report, overwrite)
     if as_json:
         print_json(calibration, written=written, exit_status=0 if failure is None else 3)
     else:
@@ -122,7 +122,8 @@ def _calibrated(recordings: tuple[Recording, ...], asked: Mapping[str, Any]) -> 
     return replace(found, created=created_now()), failure
 
 
-def _write(calibration: Calibration, output: str | None, report: str | None, overwrite: bool) -> dict[str, str]:
+def write_results(calibration: Calibration, output: str | None, report: str | None, overwrite: bool) -> dict[str, str]:
+    """Write the report and the calibration file; the names of those that were asked for."""
     written: dict[str, str] = {}
     if report is not None:
         from margcal.apps.report import write_report

@@ -13,10 +13,9 @@ import numpy as np
 
 from margcal.core import so3
 from margcal.core.types import Kind, SensorModel
-from margcal.core.units import UNITS
 from margcal.methods.uncertainty import expected_error, weakest_direction
 from margcal.workflow.align_job import AlignJob, AlignSolved
-from margcal.workflow.checks import CONDITION, EXPECTED_ERROR_DEG, GAIN_OFF, Check
+from margcal.workflow.checks import EXPECTED_ERROR_DEG, Check, condition, gain, graded
 from margcal.workflow.job import NAMES
 
 RESIDUAL = (0.10, 0.35)
@@ -35,7 +34,8 @@ def checks_of(job: AlignJob, solved: AlignSolved) -> list[Check]:
     """Every check that applies, passed ones too."""
     found: list[Check | None] = [_peak(job), *_clock(job), _overlap(job), _seen(job)]
     for model in solved.models.values():
-        found += [_expected(job, solved, model), _residual(job, model), _gain(model), _condition(model)]
+        found += [_expected(job, solved, model), _residual(job, model), gain(model, _why_gain(model))]
+        found.append(condition(model, "the motion did not show all axes"))
         found.append(_axes(job, solved, model))
     return [c for c in found if c is not None]
 
@@ -46,12 +46,6 @@ def with_expected_error(job: AlignJob, model: SensorModel) -> SensorModel:
         return model
     error = expected_error(model.kind, model.H, model.covariance, job.options.magnitude[model.kind]).direction_deg
     return replace(model, expected_error_deg=error)
-
-
-def _graded(value: float, limits: tuple[float, float]) -> tuple[str, float]:
-    if not value <= limits[1]:
-        return "fail", limits[1]
-    return ("warn", limits[0]) if value > limits[0] else ("pass", limits[0])
 
 
 def _peak(job: AlignJob) -> Check:
@@ -106,7 +100,7 @@ def _expected(job: AlignJob, solved: AlignSolved, model: SensorModel) -> Check:
     if error is None or model.covariance is None:
         text = f"{name}: this method gives no uncertainty"
         return Check("no-uncertainty", model.kind, None, EXPECTED_ERROR_DEG[0], "warn", text)
-    level, limit = _graded(error, EXPECTED_ERROR_DEG)
+    level, limit = graded(error, EXPECTED_ERROR_DEG)
     text = f"{name}: expected direction error {min(error, 180.0):.2f} degrees rms"
     if level != "pass":
         weak = weakest_direction(model.kind, model.H, model.covariance, job.options.magnitude[model.kind])
@@ -118,7 +112,7 @@ def _residual(job: AlignJob, model: SensorModel) -> Check | None:
     if model.residual_rms is None or model.kind == "gyr":
         return None
     value = model.residual_rms / job.options.magnitude[model.kind]
-    level, limit = _graded(value, RESIDUAL)
+    level, limit = graded(value, RESIDUAL)
     text = f"{NAMES[model.kind]}: residual {100 * value:.2f} % of the magnitude"
     if level != "pass":
         why = "linear acceleration, which this method takes for noise; a reference with positions would account for it"
@@ -128,32 +122,13 @@ def _residual(job: AlignJob, model: SensorModel) -> Check | None:
     return Check("residual", model.kind, value, limit, level, text)
 
 
-def _gain(model: SensorModel) -> Check | None:
-    factor = UNITS[model.kind].get(model.raw_unit)
-    if factor is None or model.unit == "norm":
-        return None
-    gains = np.linalg.svd(model.H / factor, compute_uv=False)
-    value = float(np.max(np.maximum(gains, 1 / np.maximum(gains, 1e-9))) - 1)
-    level, limit = _graded(value, GAIN_OFF)
-    text = f"{NAMES[model.kind]}: gains up to {100 * value:.0f} % off what the unit {model.raw_unit} says"
-    if level != "pass":
-        why = "is that the unit of the readings (--units)? or is the reference of another body?"
-        if model.kind == "acc" and model.method == "r-bsn":
-            why = (
-                "linear acceleration shrinks the paper's K, whatever its norm and gate; `--method lowpass-svd`, or "
-                "`forward` with positions, does not suffer from it"
-            )
-        text += f" (limit {100 * limit:g} %): {why}"
-    return Check("gain", model.kind, value, limit, level, text)
-
-
-def _condition(model: SensorModel) -> Check:
-    value = float(np.linalg.cond(model.H))
-    level, limit = _graded(value, CONDITION)
-    text = f"{NAMES[model.kind]}: the gains of its axes differ by a factor of {value:.2f}"
-    if level != "pass":
-        text += f" (limit {limit:g}); no healthy sensor does that: the motion did not show all axes"
-    return Check("condition", model.kind, value, limit, level, text)
+def _why_gain(model: SensorModel) -> str:
+    if model.kind == "acc" and model.method == "r-bsn":
+        return (
+            "linear acceleration shrinks the paper's K, whatever its norm and gate; `--method lowpass-svd`, or "
+            "`forward` with positions, does not suffer from it"
+        )
+    return "is that the unit of the readings (--units)? or is the reference of another body?"
 
 
 def _axes(job: AlignJob, solved: AlignSolved, model: SensorModel) -> Check | None:

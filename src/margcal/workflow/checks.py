@@ -75,14 +75,19 @@ def verdict_of(calibration: Calibration, asked: Sequence[Kind] | None) -> Verdic
 
 
 def _sensor_checks(job: Job, solved: Solved, model: SensorModel) -> list[Check]:
-    checks = [_expected_error(job, model), _residual(job, model), _condition(model)]
-    checks += [_gain(model), _methods_agree(job, solved, model), _remaining(job, solved, model.kind)]
+    checks = [_expected_error(job, model), _residual(job, model), condition(model, "look at its channels and units")]
+    checks += [
+        gain(model, "is that the unit of the readings? give it with --units"),
+        _methods_agree(job, solved, model),
+        _remaining(job, solved, model.kind),
+    ]
     if model.kind == "mag":
         checks += [_field_strength(job, model), _dip(job, solved)]
     return [c for c in checks if c is not None]
 
 
-def _graded(value: float, limits: tuple[float, float]) -> tuple[str, float]:
+def graded(value: float, limits: tuple[float, float]) -> tuple[str, float]:
+    """Level of `value` by its limits (warn, fail), and the limit that counts; what is not a number fails."""
     if not value <= limits[1]:
         return "fail", limits[1]
     return ("warn", limits[0]) if value > limits[0] else ("pass", limits[0])
@@ -93,7 +98,7 @@ def _expected_error(job: Job, model: SensorModel) -> Check:
     if error is None:
         text = f"{name}: this method gives no uncertainty; use the default method to know how good it is"
         return Check("no-uncertainty", model.kind, None, EXPECTED_ERROR_DEG[0], "warn", text)
-    level, limit = _graded(error, EXPECTED_ERROR_DEG)
+    level, limit = graded(error, EXPECTED_ERROR_DEG)
     text = f"{name}: expected direction error {min(error, 180.0):.2f} degrees rms"
     if level != "pass" and model.covariance is not None:
         weak = weakest_direction(model.kind, model.H, model.covariance, job.options.magnitude[model.kind])
@@ -117,12 +122,12 @@ def _residual(job: Job, model: SensorModel) -> Check | None:
     name = NAMES[model.kind]
     if model.kind == "gyr":
         value = float(np.degrees(model.residual_rms))
-        level, limit = _graded(value, TURN_RESIDUAL_DEG)
+        level, limit = graded(value, TURN_RESIDUAL_DEG)
         text = f"{name}: turns end {value:.2f} degrees rms from where the rests lie"
         text += "" if level == "pass" else "; turn more slowly, without knocks, and let the node rest in between"
         return Check("turn-residual", "gyr", value, limit, level, text)
     value = model.residual_rms / job.options.magnitude[model.kind]
-    level, limit = _graded(value, RESIDUAL)
+    level, limit = graded(value, RESIDUAL)
     text = f"{name}: residual {value * 100:.2f} % of the magnitude"
     if level != "pass":
         why = "the node moved during its rests, or the attitudes are wrong; put it down and take the hand away"
@@ -132,25 +137,27 @@ def _residual(job: Job, model: SensorModel) -> Check | None:
     return Check("residual", model.kind, value, limit, level, text)
 
 
-def _condition(model: SensorModel) -> Check:
+def condition(model: SensorModel, why: str) -> Check:
+    """Whether the gains of the axes are those of a healthy triad; `why` they may not be."""
     value = float(np.linalg.cond(model.H))
-    level, limit = _graded(value, CONDITION)
+    level, limit = graded(value, CONDITION)
     text = f"{NAMES[model.kind]}: the gains of its axes differ by a factor of {value:.2f}"
     if level != "pass":
-        text += f" (limit {limit:g}); no healthy sensor does that: look at its channels and units"
+        text += f" (limit {limit:g}); no healthy sensor does that: {why}"
     return Check("condition", model.kind, value, limit, level, text)
 
 
-def _gain(model: SensorModel) -> Check | None:
+def gain(model: SensorModel, why: str) -> Check | None:
+    """Whether the gains are about what the unit of the readings says; `why` they may not be."""
     factor = UNITS[model.kind].get(model.raw_unit)
     if factor is None or model.unit == "norm":
         return None
     gains = np.linalg.svd(model.H / factor, compute_uv=False)
-    value = float(np.max(np.maximum(gains, 1 / gains)) - 1)
-    level, limit = _graded(value, GAIN_OFF)
+    value = float(np.max(np.maximum(gains, 1 / np.maximum(gains, 1e-9))) - 1)
+    level, limit = graded(value, GAIN_OFF)
     text = f"{NAMES[model.kind]}: gains up to {value * 100:.0f} % off what the unit {model.raw_unit} says"
     if level != "pass":
-        text += f" (limit {limit * 100:g} %): is that the unit of the readings? give it with --units"
+        text += f" (limit {limit * 100:g} %): {why}"
     return Check("gain", model.kind, value, limit, level, text)
 
 
@@ -226,7 +233,7 @@ def _remaining(job: Job, solved: Solved, kind: Kind) -> Check | None:
 
 
 def _housing(value: float) -> Check:
-    level, limit = _graded(value, HOUSING_DEG)
+    level, limit = graded(value, HOUSING_DEG)
     text = f"the housing lay {value:.2f} degrees rms (each axis) from the attitudes that were taken"
     if level != "pass":
         text += f" (limit {limit:g}): the attitudes are wrong (give them with --poses FILE) or the housing lies badly"
